@@ -1,0 +1,170 @@
+"""The whole flight in one graph: start values, float solution, integers, covariances.
+
+Stages: single points and slip detection; a first graph with motion priors only, which smooths positions and velocities
+and aligns the IMUs; the full graph with float ambiguities; integers fixed, checked against their residuals and released
+where refused, re-smoothed each time; joint covariances.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph import start
+from factorgraph.errors import InputError
+from factorgraph.graphs import integers
+from factorgraph.graphs.build import Built, Receiver, build, native_factors, receivers
+from factorgraph.graphs.optimizer import Graph, Result, optimise
+from factorgraph.graphs.result import make_solution
+from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.grid import common_grid
+from factorgraph.problem import MotionPrior, NavigationProblem, Robust
+from factorgraph.registry import Progress
+from factorgraph.solution import Solution, Status
+from factorgraph.types import Array
+
+START_MOTION = MotionPrior((3.0, 3.0, 3.0))  # for the first graph, vehicles with an IMU
+START_ROBUST = {kind: Robust("huber", 2.0) for kind in ("code", "doppler", "range", "position", "height")}
+FIX_ROUNDS = 8
+REBIAS = np.array([1e-3, 1e-3, 1e-3, 0.02, 0.02, 0.02])  # bias change that asks for preintegrating again
+
+
+class Batch:
+    """Factor graph over the whole flight, solved with GTSAM."""
+
+    summary = "GTSAM factor graph over the whole flight"
+
+    def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
+        """Solve a problem. Raises InputError for what cannot be estimated; anything less is in the diagnostics."""
+        clock = _Clock(progress)
+        grid = common_grid(problem)
+        rx = receivers(problem)
+        clock.stage("start values", 0.1)
+        vehicles = [VehicleVariables(i, v, grid, problem.frame) for i, v in enumerate(problem.vehicles)]
+        notes = self._start(problem, vehicles, rx, grid)
+        clock.stage("building the graph", 0.25)
+        built = build(problem, vehicles, rx, use_phase=True)
+        for data in built.links:
+            integers.start_ambiguities(data)
+        result, ratio = self._optimise(problem, built, clock)
+        clock.stage("covariances", 0.9)
+        solution = make_solution(problem, built, result, ratio, clock.spent, notes)
+        clock.stage("done", 1.0)
+        return solution
+
+    def _start(self, problem: NavigationProblem, vehicles: list[VehicleVariables], rx: dict[str, Receiver], grid: Array) -> list[str]:
+        """Positions, velocities and attitudes into `vehicles`, by way of a graph without IMU."""
+        rough = [
+            VehicleVariables(v.index, replace(v.vehicle, motion=START_MOTION) if v.vehicle.imu is not None else v.vehicle, grid, problem.frame, use_imu=False)
+            for v in vehicles
+        ]
+        notes = []
+        known = [self._start_positions(problem, v, rx, grid) for v in rough]
+        anchors = [t.position_n for m in problem.ranges for t in m.stream.tags if t.position_n is not None]
+        fallback = np.mean(anchors, axis=0) if anchors else np.mean([v.r.mean(axis=0) for v, k in zip(rough, known, strict=True) if k] or [np.zeros(3)], axis=0)
+        rng = np.random.default_rng(0)
+        for v, is_known in zip(rough, known, strict=True):
+            if not is_known:
+                # apart from each other: ranges between coincident points have no direction
+                v.r[:] = fallback + rng.normal(0.0, 0.5, 3)
+        if not all(v.mode == "fixed" for v in rough):
+            graph = build(problem, rough, rx, use_phase=False).graph
+            graph.assemble()
+            result = optimise(graph, START_ROBUST, 30, 1e-4, lambda i, c: None)
+            if result.status is Status.SINGULAR:
+                notes.append("the start graph was singular")
+        for v, r in zip(vehicles, rough, strict=True):
+            v.r, v.v = r.r.copy(), r.v.copy()
+            if v.mode == "imu":
+                v.R, bias = start.align(v.imu, grid, v.r, v.v, problem.frame, v.vehicle.heading_hint_rad)
+                v.bias[:, :3] = bias
+        return notes
+
+    @staticmethod
+    def _start_positions(problem: NavigationProblem, v: VehicleVariables, rx: dict[str, Receiver], grid: Array) -> bool:
+        """Fill r and v from single points or position fixes; False where neither exists."""
+        if v.mode == "fixed":
+            return True
+        if v.name in rx:
+            point = rx[v.name].point
+            t = rx[v.name].vehicle.gnss.stream.t_s  # type: ignore[union-attr]
+            v.r = start.interpolate(grid, t, problem.frame.from_ecef(point.r_ecef))
+            velocity = problem.frame.rotate_from_ecef(point.v_ecef)
+            if np.any(np.all(np.isfinite(velocity), axis=1)):
+                v.v = start.interpolate(grid, t, velocity)
+            return True
+        if v.vehicle.positions:
+            p = v.vehicle.positions[0]
+            v.r = start.interpolate(grid, p.t_s, p.r_n)
+            if len(grid) > 1:
+                v.v = np.gradient(v.r, grid, axis=0)
+            return True
+        return False
+
+    def _optimise(self, problem: NavigationProblem, built: Built, clock: _Clock) -> tuple[Result, float]:
+        """Float solution, integers, releases; the result carries the whole cost history."""
+        settings, graph = problem.settings, built.graph
+        clock.stage("float solution", 0.3)
+        result = self._settle(problem, graph, clock)
+        for _ in range(4):
+            if not sum(integers.split_slipped(data, settings.ambiguity) for data in built.links if len(data.block.amb_key)):
+                break
+            result = self._continue(problem, graph, result, clock)
+        ratio = np.nan
+        if not settings.ambiguity.fix or not any(len(d.block.amb_key) for d in built.links):
+            return result, ratio
+        clock.stage("integers", 0.6)
+        for _ in range(FIX_ROUNDS):
+            if result.bayes_net is None:
+                break
+            fixed = integers.fix_integers(graph, built.links, result.bayes_net, settings.ambiguity)
+            if fixed.fixed:
+                ratio = fixed.ratio if np.isnan(ratio) else min(ratio, fixed.ratio)
+                result = self._continue(problem, graph, result, clock)
+            released = integers.release_refused(built.links, settings.ambiguity)
+            if released:
+                result = self._continue(problem, graph, result, clock)
+            if not fixed.fixed and not released:
+                break
+        return result, ratio
+
+    def _settle(self, problem: NavigationProblem, graph: Graph, clock: _Clock) -> Result:
+        """Optimise, preintegrating again while the biases move away from those preintegrated at."""
+        graph.assemble()
+        costs: list[float] = []
+        for _ in range(5):
+            result = optimise(graph, problem.settings.robust, problem.settings.max_iterations, problem.settings.tolerance, clock.iteration)
+            costs += result.costs
+            moved = [v for v in graph.vehicles if v.mode == "imu" and np.any(np.abs(v.bias - v.preintegrated_bias).max(axis=0) > REBIAS)]
+            if not moved or result.status is not Status.CONVERGED:
+                break
+            native_factors(graph)
+            for block in graph.blocks:
+                block.refresh()
+            graph.assemble()
+        return Result(result.status, costs, result.bayes_net)
+
+    def _continue(self, problem: NavigationProblem, graph: Graph, before: Result, clock: _Clock) -> Result:
+        graph.assemble()
+        result = optimise(graph, problem.settings.robust, problem.settings.max_iterations, problem.settings.tolerance, clock.iteration)
+        return Result(result.status, before.costs + result.costs, result.bayes_net)
+
+
+class _Clock:
+    """Progress and the time each stage took."""
+
+    def __init__(self, progress: Progress) -> None:
+        self.progress, self.spent = progress, {}  # type: tuple[Progress, dict[str, float]]
+        self._name, self._since, self._fraction = "", time.perf_counter(), 0.0
+
+    def stage(self, name: str, fraction: float) -> None:
+        now = time.perf_counter()
+        if self._name:
+            self.spent[self._name] = self.spent.get(self._name, 0.0) + now - self._since
+        self._name, self._since, self._fraction = name, now, fraction
+        self.progress(name, fraction)
+
+    def iteration(self, i: int, cost: float) -> None:
+        self.progress(f"{self._name}: iteration {i}, cost {cost:.4g}", self._fraction)

@@ -1,0 +1,444 @@
+"""From a navigation problem to a graph: receivers prepared, rows sorted into blocks, factors between states.
+
+The absolute code of a rover is not used where its link's reference has absolute information of its own: undifferenced
+code of the reference and differences carry everything once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from factorgraph.errors import InputError
+from factorgraph.graphs.blocks import (
+    CODE,
+    DOPPLER,
+    HEIGHT,
+    PHASE,
+    POSITION,
+    RANGE,
+    Block,
+    Endpoint,
+    GnssBlock,
+    HeightBlock,
+    JointBlock,
+    MotionBlock,
+    PositionBlock,
+    RangeBlock,
+    Rows,
+)
+from factorgraph.graphs.inertial import add_imu_factors, add_priors, motion_keys, motion_prior_rows
+from factorgraph.graphs.optimizer import Graph
+from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.models.arcs import find_arcs
+from factorgraph.models.differencing import CommonGroups
+from factorgraph.models.gnss import Prepared, SinglePoint, elevation_scale, one_code_per_satellite, pair_rows, prepare, single_point, system_of
+from factorgraph.problem import Link, NavigationProblem, RangeModel, Vehicle
+from factorgraph.start import interpolate
+from factorgraph.types import Array, BoolArray, IntArray
+
+HEADING_SIGMA_RAD = 3.0
+HINT_SIGMA_RAD = 0.3
+
+
+@dataclass(slots=True)
+class Receiver:
+    """A vehicle's receiver with its single-point solution and corrected rows."""
+
+    vehicle: Vehicle
+    point: SinglePoint
+    clock_s: Array  # (m,) interpolated over epochs without a solution
+    prepared: Prepared
+    usable: BoolArray  # (n,) rows above the mask, strong enough, with a satellite state
+
+
+@dataclass(slots=True)
+class GnssLink:
+    """A link's block and what the ambiguity resolution needs of it."""
+
+    link: Link
+    block: GnssBlock
+    arc_group: IntArray  # (arcs,) clock group of each arc
+    arc_satellite: list[str]
+    arc_signal: list[str]
+    arc_start_s: Array
+    arc_end_s: Array
+    state: list[str] = field(default_factory=list)  # per arc: "float", "fixed", "released", "datum", "unused"
+    slips: dict[str, int] = field(default_factory=dict)
+    key_base: int = 0
+    float_cyc: Array = field(default_factory=lambda: np.zeros(0))  # before fixing
+    float_sigma: Array = field(default_factory=lambda: np.zeros(0))
+
+    def make_free(self, arc: int) -> None:
+        """Give an arc its variable back."""
+        self.block.amb_key[arc] = int(gtsam.symbol("a", self.key_base + arc))
+
+
+def receivers(problem: NavigationProblem) -> dict[str, Receiver]:
+    """Single-point solutions and corrected rows of every vehicle with GNSS.
+
+    Raises InputError when a receiver never has enough satellites with ephemerides.
+    """
+    out = {}
+    settings = problem.settings
+    for v in problem.vehicles:
+        if v.gnss is None:
+            continue
+        stream, noise = v.gnss.stream, v.gnss.noise
+        if not np.any(np.isfinite(stream.sat_pos_ecef)):
+            raise InputError(f"vehicle {v.name}: no satellite has an ephemeris; check that the navigation file covers the flight's time")
+        point = single_point(stream, noise, settings.systems, stream.klobuchar, problem.t0.sow)
+        good = np.isfinite(point.clock_s)
+        if not np.any(good):
+            most = int(point.n_sat.max()) if len(point.n_sat) else 0
+            raise InputError(
+                f"vehicle {v.name}: no epoch has enough satellites for a position (at most {most} with code and ephemeris; "
+                f"4 are needed, one more for each further constellation); check systems, elevation mask and navigation file"
+            )
+        clock = np.interp(stream.t_s, stream.t_s[good], point.clock_s[good])
+        if v.fixed_n is not None:
+            r_n = np.tile(np.asarray(v.fixed_n, float), (len(stream.t_s), 1))
+        else:
+            r_n = interpolate(stream.t_s, stream.t_s, problem.frame.from_ecef(point.r_ecef))
+        prepared = prepare(stream, problem.frame, r_n, clock, stream.klobuchar, problem.t0.sow)
+        usable = (
+            np.isin(system_of(stream), list(settings.systems))
+            & (prepared.elevation_rad >= noise.elevation_mask_rad)
+            & ~(stream.cn0_dbhz < noise.min_cn0_dbhz)
+            & np.all(np.isfinite(prepared.sat_n), axis=1)
+            & np.isfinite(stream.sat_clock_m)
+        )
+        out[v.name] = Receiver(v, point, clock, prepared, usable)
+    return out
+
+
+def _gnss_rows(kind: IntArray, group: IntArray, factor: IntArray, t: Array, sigma: Array, sat: IntArray, names: list[str], **text: object) -> Rows:
+    """Rows already sorted by factor, kind, group."""
+    n_groups = int(group.max()) + 1 if len(group) else 1
+    label = (factor * 3 + kind) * n_groups + group
+    return Rows(
+        kind=kind,
+        t_s=t,
+        sigma=sigma,
+        factor=CommonGroups.from_labels(factor),
+        clocks=CommonGroups.from_labels(label),
+        label=names,
+        label_index=sat,
+        group_index=group,
+        **text,  # type: ignore[arg-type]
+    )
+
+
+def _without_singles(order: IntArray, clock_label: IntArray) -> IntArray:
+    """Rows of `order` whose clock group has at least two rows; a single row only serves its own clock."""
+    labels, inverse, count = np.unique(clock_label[order], return_inverse=True, return_counts=True)
+    return order[count[inverse] > 1]
+
+
+def link_block(problem: NavigationProblem, link: Link, ends: dict[str, VehicleVariables], rx: dict[str, Receiver], key_base: int, use_phase: bool) -> GnssLink:
+    """Differences rover - reference of code, phase and Doppler. Raises InputError when the two share nothing."""
+    ref, rov = rx[link.reference], rx[link.rover]
+    a, b = ref.vehicle.gnss, rov.vehicle.gnss
+    assert a is not None and b is not None
+    settings = problem.settings
+    pairs = pair_rows(a.stream, b.stream, ref.usable, rov.usable, settings.bands)
+    grid = ends[link.rover].t_s
+    inside = (b.stream.t_s[pairs.epoch] >= grid[0] - 0.01) & (b.stream.t_s[pairs.epoch] <= grid[-1] + 0.01)
+    if not np.any(inside):
+        common = set(a.stream.satellites) & set(b.stream.satellites)
+        raise InputError(
+            f"link {link.reference}-{link.rover}: "
+            + ("no common satellites" if not common else "no common epochs" if not len(pairs.a) else "no common usable observations")
+            + f" ({link.reference} {a.stream.t_s[0]:.1f} to {a.stream.t_s[-1]:.1f} s, {link.rover} {b.stream.t_s[0]:.1f} to {b.stream.t_s[-1]:.1f} s)"
+        )
+    ra, rb = pairs.a, pairs.b
+    lam = b.stream.wavelength_m[rb]
+    glonass = np.char.startswith(np.array(b.stream.satellites)[b.stream.sat[rb]], "R")
+    half = ((a.stream.lli[ra] | b.stream.lli[rb]) & 2) > 0
+    has_phase = np.isfinite(a.stream.phase_cyc[ra]) & np.isfinite(b.stream.phase_cyc[rb]) & ~glonass & ~half & inside & use_phase
+    arcs = find_arcs(a.stream, b.stream, pairs, has_phase, settings.ambiguity)
+    length = np.bincount(arcs.of_row[arcs.of_row >= 0], minlength=arcs.count)
+    arc = np.where((arcs.of_row >= 0) & (length[arcs.of_row] >= settings.ambiguity.min_arc_epochs), arcs.of_row, -1)
+    observed = {
+        CODE: (inside & np.isfinite(a.stream.code_m[ra]) & np.isfinite(b.stream.code_m[rb]), rov.prepared.code_m[rb] - ref.prepared.code_m[ra]),
+        PHASE: (arc >= 0, rov.prepared.phase_m[rb] - ref.prepared.phase_m[ra]),
+        DOPPLER: (
+            inside & np.isfinite(ref.prepared.rate_mps[ra]) & np.isfinite(rov.prepared.rate_mps[rb]) & np.all(np.isfinite(rov.prepared.sat_vel_n[rb]), axis=1),
+            rov.prepared.rate_mps[rb] - ref.prepared.rate_mps[ra],
+        ),
+    }
+    scale_a, scale_b = elevation_scale(ref.prepared.elevation_rad[ra]), elevation_scale(rov.prepared.elevation_rad[rb])
+    spread = {CODE: (a.noise.code_m, b.noise.code_m), PHASE: (a.noise.phase_m, b.noise.phase_m), DOPPLER: (a.noise.doppler_mps, b.noise.doppler_mps)}
+    parts = [(np.flatnonzero(use), np.full(int(use.sum()), kind), z[use]) for kind, (use, z) in observed.items()]
+    row, kind, z = (np.concatenate([p[i] for p in parts]) for i in range(3))
+    sigma = np.zeros(len(row))
+    for k, (sa, sb) in spread.items():
+        mine = kind == k
+        sigma[mine] = np.hypot(sa * scale_a[row[mine]], sb * scale_b[row[mine]])
+    # one clock per kind, signal pair and constellation: the signal pair's name begins with the constellation
+    order = np.lexsort((b.stream.sat[rb[row]], pairs.group[row], kind, pairs.epoch[row]))
+    order = _without_singles(order, (pairs.epoch[row] * 3 + kind) * len(pairs.group_names) + pairs.group[row])
+    row, kind, z, sigma = row[order], kind[order], z[order], sigma[order]
+    epoch, factor_of = np.unique(pairs.epoch[row], return_inverse=True)
+    first = np.concatenate([[0], np.flatnonzero(np.diff(factor_of)) + 1]) if len(row) else np.zeros(0, np.int64)
+    t_rover, t_ref = rov.prepared.t_s[rb[row[first]]], ref.prepared.t_s[ra[row[first]]]
+    rover = Endpoint(ends[link.rover], ends[link.rover].query(t_rover, b.lever_b))
+    reference = Endpoint(ends[link.reference], ends[link.reference].query(t_ref, a.lever_b if not ref.vehicle.is_fixed else (0.0, 0.0, 0.0)))
+    rows = _gnss_rows(
+        kind,
+        pairs.group[row],
+        factor_of,
+        t_rover[factor_of],
+        sigma,
+        b.stream.sat[rb[row]],
+        list(b.stream.satellites),
+        source=f"{link.reference}-{link.rover}",
+        group=list(pairs.group_names),
+        azimuth_rad=rov.prepared.azimuth_rad[rb[row]],
+        elevation_rad=rov.prepared.elevation_rad[rb[row]],
+    )
+    used, arc_of = np.unique(arc[row][kind == PHASE], return_inverse=True)
+    arc_row = np.full(len(row), -1, np.int64)
+    arc_row[kind == PHASE] = arc_of
+    block = GnssBlock(
+        rows,
+        rover=rover,
+        reference=reference,
+        point_rover=factor_of,
+        z=z,
+        sat_rover=rov.prepared.sat_n[rb[row]],
+        vel_rover=np.nan_to_num(rov.prepared.sat_vel_n[rb[row]]),
+        sat_reference=ref.prepared.sat_n[ra[row]],
+        vel_reference=np.nan_to_num(ref.prepared.sat_vel_n[ra[row]]),
+        wavelength_m=lam[row],
+        arc=arc_row,
+    )
+    link_data = GnssLink(link, block, np.zeros(0, np.int64), [], [], np.zeros(0), np.zeros(0), slips=arcs.slips, key_base=key_base)
+    describe_arcs(link_data)
+    return link_data
+
+
+def describe_arcs(data: GnssLink) -> None:
+    """Fill the arc tables of a link from its block's rows, with a fresh float variable for every arc."""
+    block = data.block
+    n = int(block.arc.max()) + 1 if len(block.arc) else 0
+    rows = np.flatnonzero(block.arc >= 0)
+    first, last = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    last[block.arc[rows]] = rows
+    first[block.arc[rows[::-1]]] = rows[::-1]
+    data.arc_group = block.rows.group_index[first]
+    data.arc_satellite = [block.rows.label[i] for i in block.rows.label_index[first]]
+    data.arc_signal = [block.rows.group[g] for g in data.arc_group]
+    data.arc_start_s, data.arc_end_s = block.rows.t_s[first], block.rows.t_s[last]
+    block.amb_key = np.array([gtsam.symbol("a", data.key_base + i) for i in range(n)], np.int64)
+    block.amb_value = np.zeros(n)
+    data.state = ["float"] * n
+
+
+def absolute_block(problem: NavigationProblem, name: str, ends: dict[str, VehicleVariables], rx: Receiver, with_code: bool) -> GnssBlock | None:
+    """Undifferenced code (one signal per satellite) and Doppler of a moving receiver."""
+    antenna = rx.vehicle.gnss
+    assert antenna is not None
+    stream, noise = antenna.stream, antenna.noise
+    grid = ends[name].t_s
+    rows = one_code_per_satellite(stream, rx.usable)
+    t = rx.prepared.t_s[rows]
+    rows = rows[(t >= grid[0] - 0.01) & (t <= grid[-1] + 0.01)]
+    rate_ok = np.isfinite(rx.prepared.rate_mps[rows]) & np.all(np.isfinite(rx.prepared.sat_vel_n[rows]), axis=1)
+    parts = []
+    if with_code:
+        parts.append((rows, np.full(len(rows), CODE), rx.prepared.code_m[rows]))
+    parts.append((rows[rate_ok], np.full(int(rate_ok.sum()), DOPPLER), rx.prepared.rate_mps[rows[rate_ok]]))
+    row, kind, z = (np.concatenate([p[i] for p in parts]) for i in range(3))
+    letters, system = np.unique(system_of(stream)[row], return_inverse=True)
+    order = np.lexsort((stream.sat[row], system, kind, stream.epoch[row]))
+    order = _without_singles(order, (stream.epoch[row] * 3 + kind) * max(len(letters), 1) + system)
+    row, kind, z, system = row[order], kind[order], z[order], system[order]
+    if not len(row):
+        return None
+    interval = float(np.median(np.diff(stream.t_s))) if len(stream.t_s) > 1 else 1.0
+    persist = np.sqrt(max(1.0, noise.absolute_correlation_s / interval))
+    scale = elevation_scale(rx.prepared.elevation_rad[row])
+    sigma = np.where(kind == CODE, noise.absolute_code_m * persist, noise.doppler_mps) * scale
+    _, factor_of = np.unique(stream.epoch[row], return_inverse=True)
+    first = np.concatenate([[0], np.flatnonzero(np.diff(factor_of)) + 1])
+    times = rx.prepared.t_s[row[first]]
+    table = _gnss_rows(
+        kind,
+        system,
+        factor_of,
+        times[factor_of],
+        sigma,
+        stream.sat[row],
+        list(stream.satellites),
+        source=name,
+        group=[str(s) for s in letters],
+        azimuth_rad=rx.prepared.azimuth_rad[row],
+        elevation_rad=rx.prepared.elevation_rad[row],
+    )
+    zero = np.zeros((len(row), 3))
+    return GnssBlock(
+        table,
+        rover=Endpoint(ends[name], ends[name].query(times, antenna.lever_b)),
+        reference=None,
+        point_rover=factor_of,
+        z=z,
+        sat_rover=rx.prepared.sat_n[row],
+        vel_rover=np.nan_to_num(rx.prepared.sat_vel_n[row]),
+        sat_reference=zero,
+        vel_reference=zero,
+        wavelength_m=stream.wavelength_m[row],
+        arc=np.full(len(row), -1, np.int64),
+    )
+
+
+def _plain_rows(kind: int, t: Array, sigma: Array, factor: IntArray, source: str, label: list[str], label_index: IntArray) -> Rows:
+    nothing = np.full(len(t), np.nan)
+    zeros = np.zeros(len(t), np.int64)
+    return Rows(
+        np.full(len(t), kind), t, sigma, CommonGroups.from_labels(factor), None, source, label, label_index, [""], zeros, nothing, nothing
+    )
+
+
+def _in_grid(t: Array, grid: Array) -> BoolArray:
+    return np.asarray((t >= grid[0] - 1e-6) & (t <= grid[-1] + 1e-6))
+
+
+def position_blocks(vehicle: Vehicle, end: VehicleVariables) -> list[Block]:
+    blocks: list[Block] = []
+    for p in vehicle.positions:
+        ok = _in_grid(p.t_s, end.t_s) & np.all(np.isfinite(p.r_n), axis=1)
+        n = int(ok.sum())
+        if n:
+            rows = _plain_rows(
+                POSITION, np.repeat(p.t_s[ok], 3), p.sigma_m[ok].ravel(), np.repeat(np.arange(n), 3), f"{vehicle.name}/{p.name}", ["E", "N", "U"], np.tile(np.arange(3), n)
+            )
+            blocks.append(PositionBlock(rows, end=Endpoint(end, end.query(p.t_s[ok], p.lever_b)), z_n=p.r_n[ok]))
+    for h in vehicle.heights:
+        ok = _in_grid(h.t_s, end.t_s) & np.isfinite(h.up_m)
+        n = int(ok.sum())
+        if n:
+            rows = _plain_rows(HEIGHT, h.t_s[ok], h.sigma_m[ok], np.arange(n), f"{vehicle.name}/{h.name}", ["U"], np.zeros(n, np.int64))
+            blocks.append(HeightBlock(rows, end=Endpoint(end, end.query(h.t_s[ok], h.lever_b)), z_m=h.up_m[ok]))
+    return blocks
+
+
+def range_blocks(model: RangeModel, ends: dict[str, VehicleVariables], first_parameter: int) -> list[RangeBlock]:
+    """A block per pair of carriers (vehicle-vehicle or vehicle-anchor); parameters per block or one for the set."""
+    stream = model.stream
+    tags = stream.tags
+    blocks: list[RangeBlock] = []
+    estimated = model.bias_sigma_m > 0 or model.scale_sigma > 0
+    carrier = np.array([tag.vehicle or "" for tag in tags])
+    grid = next(iter(ends.values())).t_s
+    # the first end is always on a vehicle
+    swap = carrier[stream.tag_a] == ""
+    a, b = np.where(swap, stream.tag_b, stream.tag_a), np.where(swap, stream.tag_a, stream.tag_b)
+    ok = _in_grid(stream.t_s, grid) & np.isfinite(stream.range_m) & (carrier[a] != carrier[b])
+    lever = np.array([tag.lever_b for tag in tags])
+    anchor = np.array([tag.position_n or (np.nan,) * 3 for tag in tags])
+    pair = np.char.add(np.char.add(carrier[a], "\n"), carrier[b])
+    for name in np.unique(pair[ok]):
+        rows = np.flatnonzero(ok & (pair == name))
+        va, vb = str(name).split("\n")
+        t = stream.t_s[rows]
+        labels, index = np.unique([f"{tags[i].name}-{tags[j].name}" for i, j in zip(a[rows], b[rows], strict=True)], return_inverse=True)
+        table = _plain_rows(
+            RANGE, t, stream.sigma_m[rows], np.arange(len(rows)), f"{stream.name} {va}-{vb or 'anchors'}", [str(s) for s in labels], index
+        )
+        other = Endpoint(ends[vb], ends[vb].query(t, lever[b[rows]])) if vb else None
+        parameter = None
+        if estimated:
+            parameter = int(gtsam.symbol("s", first_parameter + (len(blocks) if model.per_pair else 0)))
+        blocks.append(
+            RangeBlock(
+                table,
+                a=Endpoint(ends[va], ends[va].query(t, lever[a[rows]])),
+                b=other,
+                anchor_n=None if other is not None else anchor[b[rows]],
+                z_m=stream.range_m[rows],
+                parameter=parameter,
+                model=model,
+            )
+        )
+    return blocks
+
+
+def motion_block(vehicle: VehicleVariables) -> MotionBlock:
+    L, J = motion_prior_rows(vehicle)
+    n = len(L)
+    rows = _plain_rows(-1, np.repeat(vehicle.t_s[1:], 6), np.ones(6 * n), np.repeat(np.arange(n), 6), vehicle.name, ["motion"], np.zeros(6 * n, np.int64))
+    return MotionBlock(rows, vehicle=vehicle, keys_of=[motion_keys(vehicle, k) for k in range(n)], L=L, J0=J)
+
+
+def joint_block(a: VehicleVariables, b: VehicleVariables) -> JointBlock:
+    """Rows without information that keep two vehicles' states of one time in one clique, so that their covariance is at hand."""
+    n = len(a.t_s)
+    rows = _plain_rows(-1, a.t_s, np.ones(n), np.arange(n), f"{a.name}-{b.name}", ["joint"], np.zeros(n, np.int64))
+    return JointBlock(rows, a=a, b=b)
+
+
+@dataclass(slots=True)
+class Built:
+    """A graph with the parts that the ambiguity resolution and the solution refer to."""
+
+    graph: Graph
+    links: list[GnssLink]
+
+
+def native_factors(graph: Graph) -> None:
+    """(Re)build the native factors: IMU at the current bias, priors, parameter priors."""
+    graph.native = gtsam.NonlinearFactorGraph()
+    for v in graph.vehicles:
+        if v.mode == "imu":
+            add_imu_factors(graph.native, v)
+        add_priors(graph.native, v, HINT_SIGMA_RAD if v.vehicle.heading_hint_rad is not None else HEADING_SIGMA_RAD)
+    seen = set()
+    for block in graph.ranges:
+        model = block.model
+        if block.parameter is not None and block.parameter not in seen:
+            seen.add(block.parameter)
+            sigmas = np.array([max(model.bias_sigma_m, 1e-6), max(model.scale_sigma, 1e-9)])
+            graph.native.add(gtsam.PriorFactorVector(block.parameter, np.zeros(2), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+
+
+def build(
+    problem: NavigationProblem, vehicles: list[VehicleVariables], rx: dict[str, Receiver], use_phase: bool, progress: Callable[[float], None] = lambda f: None
+) -> Built:
+    """All blocks and native factors for variables that already hold start values."""
+    ends = {v.name: v for v in vehicles}
+    graph = Graph(vehicles, [], gtsam.NonlinearFactorGraph())
+    links: list[GnssLink] = []
+    rovers = {link.rover for link in problem.links}
+    key_base = 0
+    for link in problem.links:
+        if link.reference in rx and link.rover in rx:
+            data = link_block(problem, link, ends, rx, key_base, use_phase)
+            key_base += 1_000_000
+            links.append(data)
+            graph.gnss.append(data.block)
+    absolute: list[Block] = []
+    for v in problem.vehicles:
+        if v.name in rx and not v.is_fixed and problem.settings.use_absolute and not v.positions:
+            block = absolute_block(problem, v.name, ends, rx[v.name], with_code=v.name not in rovers)
+            if block is not None and v.name not in rovers:
+                absolute.append(block)
+    for i, model in enumerate(problem.ranges):
+        graph.ranges += range_blocks(model, ends, i * 10_000)
+    others: list[Block] = []
+    for v in vehicles:
+        others += position_blocks(v.vehicle, v)
+        if v.mode == "motion":
+            others.append(motion_block(v))
+    for pair in problem.wanted_pairs:
+        both = [ends[pair.reference], ends[pair.rover]]
+        if all(end.mode != "fixed" for end in both):
+            others.append(joint_block(both[0], both[1]))
+    graph.blocks = [*graph.gnss, *absolute, *graph.ranges, *others]
+    progress(0.5)
+    native_factors(graph)
+    progress(1.0)
+    return Built(graph, links)

@@ -1,0 +1,161 @@
+"""Our own Gauss-Newton / Levenberg-Marquardt loop over a GTSAM graph.
+
+GTSAM linearises and eliminates; the loop, the robust weights, the damping and the convergence test are here, because a
+C++ optimizer copies all values into every Python factor call. One iteration: evaluate blocks, reweight, linearise,
+eliminate in COLAMD order with ambiguities and range parameters last, step; a step that raises the robust cost is undone
+and the damping raised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from factorgraph.graphs.blocks import Block, GnssBlock, RangeBlock
+from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.problem import Robust
+from factorgraph.solution import Status
+
+LAMBDA_START, LAMBDA_MAX = 1e-4, 1e8
+DIMENSION = {"x": 6, "b": 6, "p": 3, "v": 3, "a": 1, "s": 2}  # of a variable, by the letter of its key
+
+
+@dataclass(slots=True)
+class Result:
+    """How an optimisation ended."""
+
+    status: Status
+    costs: list[float]
+    bayes_net: gtsam.GaussianBayesNet | None = None
+
+
+@dataclass(slots=True)
+class Graph:
+    """Native factors that stay, blocks that are evaluated anew, and the variables of both."""
+
+    vehicles: list[VehicleVariables]
+    blocks: list[Block]
+    native: gtsam.NonlinearFactorGraph
+    gnss: list[GnssBlock] = field(default_factory=list)
+    ranges: list[RangeBlock] = field(default_factory=list)
+    values: gtsam.Values = field(default_factory=gtsam.Values)
+    graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    last: list[int] = field(default_factory=list)
+
+    def assemble(self) -> None:
+        """Collect factors and values; call again after ambiguities were fixed or released or factors renewed."""
+        self.graph = gtsam.NonlinearFactorGraph()
+        self.graph.push_back(self.native)
+        for block in self.blocks:
+            block.add_factors(self.graph)
+        self.values = gtsam.Values()
+        for vehicle in self.vehicles:
+            vehicle.insert(self.values)
+        self.last = []
+        used = set(self.graph.keyVector())
+        for gnss in self.gnss:
+            for k, value in zip(gnss.amb_key, gnss.amb_value, strict=True):
+                if k in used:
+                    self.values.insert(int(k), np.array([value]))
+                    self.last.append(int(k))
+        for block in self.ranges:
+            if block.parameter is not None and block.parameter not in self.last:
+                self.values.insert(block.parameter, block.value.copy())
+                self.last.append(block.parameter)
+
+    def take(self, values: gtsam.Values) -> None:
+        """Make `values` current and evaluate every block there."""
+        self.values = values
+        for vehicle in self.vehicles:
+            vehicle.extract(values)
+        for gnss in self.gnss:
+            for i, k in enumerate(gnss.amb_key):
+                if k and values.exists(int(k)):
+                    gnss.amb_value[i] = values.atVector(int(k))[0]
+        for block in self.ranges:
+            if block.parameter is not None:
+                block.value = values.atVector(block.parameter)
+        for block in self.blocks:
+            block.predict()
+
+    def cost(self, robust: dict[str, Robust]) -> float:
+        return self.native.error(self.values) + sum(b.cost(robust) for b in self.blocks)
+
+    def linearize(self) -> gtsam.GaussianFactorGraph:
+        for block in self.blocks:
+            block.whiten()
+        return self.graph.linearize(self.values)
+
+    def ordering(self, linear: gtsam.GaussianFactorGraph) -> gtsam.Ordering:
+        if self.last:
+            return gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, self.last)
+        return gtsam.Ordering.ColamdGaussianFactorGraph(linear)
+
+
+def eliminate(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.GaussianBayesNet | None:
+    """Cholesky, QR where Cholesky calls the system indeterminate, None where it is singular."""
+    try:
+        return linear.eliminateSequential(ordering)
+    except RuntimeError:
+        try:
+            return linear.eliminateSequential(ordering, gtsam.EliminateQR)
+        except RuntimeError:
+            return None
+
+
+def _damped(linear: gtsam.GaussianFactorGraph, lam: float) -> gtsam.GaussianFactorGraph:
+    damped = linear.clone()
+    for k in linear.keyVector():
+        n = DIMENSION[chr(gtsam.symbolChr(k))]
+        damped.add(gtsam.JacobianFactor(k, np.eye(n) * np.sqrt(lam), np.zeros(n), gtsam.noiseModel.Unit.Create(n)))
+    return damped
+
+
+def optimise(
+    graph: Graph, robust: dict[str, Robust], max_iterations: int, tolerance: float, progress: Callable[[int, float], None]
+) -> Result:
+    """Minimise the robust cost from the current values; the result's Bayes net belongs to the last linearisation.
+
+    Converged when the cost falls by less than `tolerance` of itself (plus an absolute 1e-6). The steps are Gauss-Newton
+    while the cost falls; otherwise Levenberg-Marquardt with damping relative to unit information.
+    """
+    graph.take(graph.values)
+    for block in graph.blocks:
+        block.reweight(robust)
+    cost = graph.cost(robust)
+    costs = [cost]
+    lam = 0.0
+    net = None
+    for iteration in range(max_iterations):
+        for block in graph.blocks:
+            block.reweight(robust)
+        linear = graph.linearize()
+        order = graph.ordering(linear)
+        before = graph.values
+        while True:
+            net = eliminate(linear if lam == 0 else _damped(linear, lam), order)
+            if net is not None:
+                graph.take(before.retract(net.optimize()))
+                new = graph.cost(robust)
+                if np.isfinite(new) and new <= cost * (1 + 1e-9) + 1e-9:
+                    break
+                graph.take(before)
+            lam = LAMBDA_START if lam == 0 else lam * 10
+            if lam > LAMBDA_MAX:
+                status = Status.SINGULAR if net is None else Status.STALLED
+                return Result(status, costs, _final_net(graph))
+        lam = 0.0 if lam <= LAMBDA_START else lam / 10
+        decrease, cost = cost - new, new
+        costs.append(cost)
+        progress(iteration + 1, cost)
+        if lam == 0.0 and decrease < tolerance * cost + 1e-6:
+            return Result(Status.CONVERGED, costs, _final_net(graph))
+    return Result(Status.MAX_ITERATIONS, costs, _final_net(graph))
+
+
+def _final_net(graph: Graph) -> gtsam.GaussianBayesNet | None:
+    linear = graph.linearize()
+    return eliminate(linear, graph.ordering(linear))

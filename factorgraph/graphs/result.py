@@ -1,0 +1,374 @@
+"""The solution of a graph: trajectories with covariances, pairs, ambiguities, residuals, diagnostics."""
+
+from __future__ import annotations
+
+import dataclasses
+import platform
+from importlib.metadata import PackageNotFoundError, version
+
+import numpy as np
+
+from factorgraph import geodesy
+from factorgraph.attitude import quat_from_matrix
+from factorgraph.graphs.blocks import KINDS, Block, GnssBlock, JointBlock, MotionBlock
+from factorgraph.graphs.build import Built, GnssLink
+from factorgraph.graphs.covariance import JointCovariance
+from factorgraph.graphs.integers import tail_covariance
+from factorgraph.graphs.optimizer import Graph, Result
+from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.problem import Link, NavigationProblem
+from factorgraph.solution import (
+    ATT,
+    BA,
+    BG,
+    POS,
+    VEL,
+    AmbiguityTable,
+    Diagnostics,
+    Fix,
+    PairSolution,
+    ResidualTable,
+    Solution,
+    Status,
+    VehicleSolution,
+)
+from factorgraph.types import Array, BoolArray, IntArray
+
+FIXED_DIFFERENCES = 4  # double differences with integers that make an epoch fixed
+
+
+def make_solution(problem: NavigationProblem, built: Built, result: Result, ratio: float, spent: dict[str, float], notes: list[str]) -> Solution:
+    """Collect everything known after the optimisation."""
+    graph = built.graph
+    cov = JointCovariance(result.bayes_net) if result.bayes_net is not None else None
+    vehicles = tuple(_vehicle(v, cov) for v in graph.vehicles)
+    ends = {v.name: v for v in graph.vehicles}
+    links = {(d.link.reference, d.link.rover): d for d in built.links}
+    pairs = tuple(_pair(problem, p, ends, cov, links.get((p.reference, p.rover)), ratio) for p in problem.wanted_pairs)
+    residuals = _residuals(graph, problem.settings.outlier_sigma)
+    nis_t, nis, dof = _nis(graph, cov)
+    return Solution(
+        name=problem.name,
+        method="graph",
+        t0=problem.t0,
+        frame=problem.frame,
+        vehicles=vehicles,
+        pairs=pairs,
+        ambiguities=_ambiguities(graph, built.links, result),
+        residuals=residuals,
+        diagnostics=Diagnostics(
+            status=result.status,
+            n_iterations=max(len(result.costs) - 1, 0),
+            cost=np.array(result.costs),
+            runtime_s=dict(spent),
+            nis_t_s=nis_t,
+            nis=nis,
+            nis_dof=dof,
+            warnings=tuple(_warnings(problem, built, result, pairs)),
+            notes=(*notes, *_slip_notes(built.links)),
+            parameters=_parameters(graph, cov),
+        ),
+        configuration=configuration(problem),
+        versions=versions(),
+    )
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computed the solution."""
+    found = {"python": platform.python_version()}
+    for name in ("relnav", "gtsam", "numpy", "scipy", "numba"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found
+
+
+def configuration(problem: NavigationProblem) -> dict[str, object]:
+    """The problem's choices as plain JSON types: everything but the measurements."""
+
+    def plain(value: object) -> object:
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        if isinstance(value, dict):
+            return {str(k): plain(v) for k, v in value.items()}
+        if isinstance(value, (tuple, list)):
+            return [plain(v) for v in value]
+        return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
+
+    return {
+        "settings": plain(problem.settings),
+        "vehicles": {
+            v.name: {
+                "fixed_n": plain(v.fixed_n),
+                "imu_noise": plain(v.imu_noise) if v.imu is not None else None,
+                "gnss_noise": plain(v.gnss.noise) if v.gnss is not None else None,
+                "gnss_lever_b": plain(v.gnss.lever_b) if v.gnss is not None else None,
+                "motion": plain(v.motion) if v.imu is None else None,
+            }
+            for v in problem.vehicles
+        },
+        "links": [plain(link) for link in problem.links],
+        "ranges": [
+            {"name": m.stream.name, "bias_sigma_m": m.bias_sigma_m, "scale_sigma": m.scale_sigma, "per_pair": m.per_pair} for m in problem.ranges
+        ],
+    }
+
+
+def _state_map(v: VehicleVariables, k: int) -> Array:
+    """d(position, velocity, attitude, gyro bias, accel bias errors) / d(local columns), (15, w)."""
+    if v.mode == "motion":
+        T = np.zeros((15, 6))
+        T[POS, :3], T[VEL, 3:] = np.eye(3), np.eye(3)
+        return T
+    T = np.zeros((15, 15))
+    R = v.R[k]
+    T[POS, 3:6], T[VEL, 6:9], T[ATT, 0:3] = R, np.eye(3), -R
+    T[BA, 9:12], T[BG, 12:15] = np.eye(3), np.eye(3)
+    return T
+
+
+def _vehicle(v: VehicleVariables, cov: JointCovariance | None) -> VehicleSolution:
+    K = len(v.t_s)
+    P = np.full((K, 15, 15), np.nan)
+    nan3 = np.full((K, 3), np.nan)
+    if v.mode == "fixed":
+        P[:, :6, :6] = 0.0
+        return VehicleSolution(v.name, v.t_s, v.r, v.v, np.full((K, 4), np.nan), nan3, nan3, P, v.vehicle.truth, True)
+    if cov is not None:
+        n = 15 if v.mode == "imu" else 6
+        for k in range(K):
+            T = _state_map(v, k)[:n]
+            P[k, :n, :n] = T @ cov.joint(v.keys(k)) @ T.T
+    if v.mode == "imu":
+        return VehicleSolution(v.name, v.t_s, v.r, v.v, quat_from_matrix(v.R), v.bias[:, :3], v.bias[:, 3:], P, v.vehicle.truth)
+    return VehicleSolution(v.name, v.t_s, v.r, v.v, np.full((K, 4), np.nan), nan3, nan3, P, v.vehicle.truth)
+
+
+def _pair(
+    problem: NavigationProblem, pair: Link, ends: dict[str, VehicleVariables], cov: JointCovariance | None, link: GnssLink | None, ratio: float
+) -> PairSolution:
+    a, b = ends[pair.reference], ends[pair.rover]
+    K = len(a.t_s)
+    lat, lon, _ = geodesy.geodetic_from_ecef(problem.frame.to_ecef(a.r))
+    C = geodesy.C_en(lat, lon) @ problem.frame.C_en.T  # n -> ENU at the reference
+    P = np.full((K, 6, 6), np.nan)
+    if cov is not None:
+        for k in range(K):
+            P[k] = _relative_covariance(a, b, k, cov)
+        CC = np.zeros((K, 6, 6))
+        CC[:, :3, :3], CC[:, 3:, 3:] = C, C
+        P = CC @ P @ np.swapaxes(CC, 1, 2)
+    fix, n_sat, ratios = _fix_status(link, b, K, ratio)
+    truth, truth_v = _pair_truth(a, b, C)
+    return PairSolution(
+        pair.reference,
+        pair.rover,
+        a.t_s,
+        np.einsum("kij,kj->ki", C, b.r - a.r),
+        np.einsum("kij,kj->ki", C, b.v - a.v),
+        P,
+        fix,
+        ratios,
+        n_sat,
+        truth,
+        truth_v,
+    )
+
+
+def _relative_covariance(a: VehicleVariables, b: VehicleVariables, k: int, cov: JointCovariance) -> Array:
+    keys, blocks = [], []
+    for v, sign in ((a, -1.0), (b, 1.0)):
+        if v.mode == "fixed":
+            continue
+        keys += list(v.keys(k)[:2])
+        width = 9 if v.mode == "imu" else 6
+        blocks.append(sign * _state_map(v, k)[:6, :width])
+    T = np.hstack(blocks)
+    return np.asarray(T @ cov.joint(keys) @ T.T)
+
+
+def _pair_truth(a: VehicleVariables, b: VehicleVariables, C: Array) -> tuple[Array | None, Array | None]:
+    r, v = [], []
+    for end in (a, b):
+        truth = end.vehicle.truth
+        if end.mode == "fixed":
+            r.append(end.r)
+            v.append(end.v)
+        elif truth is None:
+            return None, None
+        else:
+            outside = (end.t_s < truth.t_s[0] - 1e-6) | (end.t_s > truth.t_s[-1] + 1e-6)
+            r.append(np.where(outside[:, None], np.nan, interpolated(truth.t_s, truth.r_n, end.t_s)))
+            if truth.v_n is not None:
+                v.append(np.where(outside[:, None], np.nan, interpolated(truth.t_s, truth.v_n, end.t_s)))
+    dv = np.einsum("kij,kj->ki", C, v[1] - v[0]) if len(v) == 2 else None
+    return np.einsum("kij,kj->ki", C, r[1] - r[0]), dv
+
+
+def interpolated(t: Array, x: Array, at: Array) -> Array:
+    """Columns of x (n, 3) at times, linear."""
+    return np.column_stack([np.interp(at, t, x[:, j]) for j in range(x.shape[1])])
+
+
+def _fix_status(link: GnssLink | None, rover: VehicleVariables, K: int, ratio: float) -> tuple[IntArray, IntArray, Array]:
+    """Per grid time: Fix value, satellites in the differences, ratio."""
+    fix, n_sat, ratios = np.zeros(K, np.int64), np.zeros(K, np.int64), np.full(K, np.nan)
+    if link is None:
+        return fix, n_sat, ratios
+    block = link.block
+    clocks = block.rows.clocks
+    assert clocks is not None
+    k_row = block.rover.query.k[block.point_rover]
+    sat = block.rows.label_index
+    seen = np.unique(k_row * (int(sat.max()) + 1) + sat)
+    n_sat += np.bincount(seen // (int(sat.max()) + 1), minlength=K)
+    phase = block.arc >= 0
+    held = np.zeros(block.n, bool)
+    state = np.array(link.state or [""])
+    held[phase] = np.isin(state[block.arc[phase]], ["fixed", "datum"])
+    in_group = clocks.sum(held.astype(float))
+    k_group = k_row[clocks.start]
+    differences = np.bincount(k_group, np.maximum(in_group - 1, 0), minlength=K)
+    any_phase = np.bincount(k_row[phase], minlength=K) > 0
+    fix[any_phase] = Fix.FLOAT.value
+    fix[differences >= 1] = Fix.PARTIAL.value
+    fix[differences >= FIXED_DIFFERENCES] = Fix.FIXED.value
+    ratios[fix >= Fix.PARTIAL.value] = ratio
+    return fix, n_sat, ratios
+
+
+def _ambiguities(graph: Graph, links: list[GnssLink], result: Result) -> AmbiguityTable:
+    rows: list[tuple[str, str, str, float, float, float, float, float, str]] = []
+    for data in links:
+        block = data.block
+        free = [i for i in range(len(block.amb_key)) if block.amb_key[i] != 0 and graph.values.exists(int(block.amb_key[i]))]
+        sigma = np.full(len(block.amb_key), np.nan)
+        if free and result.bayes_net is not None:
+            sigma[free] = np.sqrt(np.diag(tail_covariance(result.bayes_net, [int(block.amb_key[i]) for i in free])))
+        for i, state in enumerate(data.state):
+            integer = float(block.amb_value[i]) if state in ("fixed", "datum") else np.nan
+            rows.append(
+                (
+                    f"{data.link.reference}-{data.link.rover}",
+                    data.arc_satellite[i],
+                    data.arc_signal[i],
+                    float(data.arc_start_s[i]),
+                    float(data.arc_end_s[i]),
+                    float(data.float_cyc[i]) if len(data.float_cyc) else float(block.amb_value[i]),
+                    float(data.float_sigma[i]) if state == "fixed" and len(data.float_sigma) else float(sigma[i]),
+                    integer,
+                    state,
+                )
+            )
+    if not rows:
+        return AmbiguityTable()
+    c = list(zip(*rows, strict=True))
+    return AmbiguityTable(c[0], c[1], c[2], *(np.array(x, float) for x in c[3:8]), c[8])
+
+
+def _measured(graph: Graph) -> list[Block]:
+    return [b for b in graph.blocks if not isinstance(b, (MotionBlock, JointBlock))]
+
+
+def _residuals(graph: Graph, outlier_sigma: float) -> ResidualTable:
+    blocks = _measured(graph)
+    if not blocks:
+        return ResidualTable()
+    sources: list[str] = []
+    labels: list[str] = []
+    parts: list[tuple[Array, ...]] = []
+    for b in blocks:
+        rows = b.rows
+        active = b.active
+        names = [f"{rows.source} {g}".strip() for g in rows.group]
+        t = b.normalised()
+        source = np.array([_index(sources, n) for n in names])[rows.group_index]
+        label = np.array([_index(labels, n) for n in rows.label])[rows.label_index]
+        outlier: BoolArray = np.abs(t) > outlier_sigma
+        columns = (rows.kind, source, label, rows.t_s, b.residuals(), rows.sigma, b.w, outlier, rows.azimuth_rad, rows.elevation_rad)
+        parts.append(tuple(np.asarray(c)[active] for c in columns))
+    joined = [np.concatenate([p[i] for p in parts]) for i in range(len(parts[0]))]
+    return ResidualTable(KINDS, tuple(sources), tuple(labels), *joined)
+
+
+def _index(names: list[str], name: str) -> int:
+    if name not in names:
+        names.append(name)
+    return names.index(name)
+
+
+def _nis(graph: Graph, cov: JointCovariance | None) -> tuple[Array, Array, Array]:
+    """Sum of squared whitened residuals and its expectation per state time.
+
+    E[e^T e] = rows - clocks - trace(J P J^T) for a factor with whitened Jacobian J and posterior covariance P of its
+    variables; rows that robust weights push down count by their weight.
+    """
+    blocks = _measured(graph)
+    if not blocks or cov is None:
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    t = graph.vehicles[0].t_s
+    total, dof = np.zeros(len(t)), np.zeros(len(t))
+    for b in blocks:
+        b.whiten()
+        starts = b.rows.factor.start
+        sq = b.rows.factor.sum(b.e**2)
+        rows = b.rows.factor.sum((b.w > 0.5).astype(float))
+        k = np.clip(np.searchsorted(t, b.rows.t_s[starts] + 5e-3, side="right") - 1, 0, len(t) - 1)
+        n_clocks = np.zeros(len(starts))
+        if b.rows.clocks is not None:
+            np.add.at(n_clocks, b.rows.factor.of_row[b.rows.clocks.start], 1.0)
+        for f in range(len(starts)):
+            keys = b.keys(f)
+            J = np.hstack(b.columns(f))
+            used = float(np.einsum("ij,jk,ik->", J, cov.joint(keys), J)) if keys else 0.0
+            total[k[f]] += sq[f]
+            dof[k[f]] += max(rows[f] - n_clocks[f] - used, 0.0)
+    seen = dof > 0
+    return t[seen], total[seen], dof[seen]
+
+
+def _parameters(graph: Graph, cov: JointCovariance | None) -> dict[str, tuple[float, float]]:
+    out: dict[str, tuple[float, float]] = {}
+    for block in graph.ranges:
+        if block.parameter is None:
+            continue
+        P = cov.block(block.parameter, block.parameter) if cov is not None else None
+        sigma = np.sqrt(np.diag(P)) if P is not None else np.full(2, np.nan)
+        name = block.rows.source if block.model.per_pair else block.model.stream.name
+        if block.model.bias_sigma_m > 0:
+            out[f"{name} bias [m]"] = (float(block.value[0]), float(sigma[0]))
+        if block.model.scale_sigma > 0:
+            out[f"{name} scale [1]"] = (float(block.value[1]), float(sigma[1]))
+    return out
+
+
+def _warnings(problem: NavigationProblem, built: Built, result: Result, pairs: tuple[PairSolution, ...]) -> list[str]:
+    out = []
+    if result.status is not Status.CONVERGED:
+        out.append(f"the optimisation stopped early: {result.status.value}")
+    if result.bayes_net is None:
+        out.append("no covariance: the normal matrix is singular")
+    for data in built.links:
+        name = f"{data.link.reference}-{data.link.rover}"
+        pair = next((p for p in pairs if (p.reference, p.rover) == (data.link.reference, data.link.rover)), None)
+        if not problem.settings.ambiguity.fix or pair is None:
+            continue
+        with_phase = pair.fix > 0
+        if not np.any(with_phase):
+            out.append(f"{name}: no usable carrier phase; the baseline rests on code alone")
+        elif not np.any(pair.fix == Fix.FIXED.value):
+            out.append(f"{name}: no epoch's ambiguities could be fixed; the baseline is a float solution")
+    return out
+
+
+def _slip_notes(links: list[GnssLink]) -> list[str]:
+    notes = []
+    for data in links:
+        found = ", ".join(f"{n} by {reason}" for reason, n in data.slips.items() if n)
+        released = sum(s == "released" for s in data.state)
+        text = f"{data.link.reference}-{data.link.rover}: {len(data.state)} phase arcs"
+        text += f"; arcs ended: {found}" if found else ""
+        text += f"; {released} integers released" if released else ""
+        notes.append(text)
+    return notes

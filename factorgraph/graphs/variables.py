@@ -1,0 +1,200 @@
+"""Variables of the graph: every vehicle's pose, velocity and bias on one time grid, and points observed from them.
+
+Keys: `x` Pose3 (body to n), `v` velocity in n, `b` bias (accelerometer, gyroscope as GTSAM orders them); a vehicle
+without an IMU has `p` (position of its antenna in n) instead of `x` and no bias; a base station has no variables.
+`a` are ambiguities in cycles, `s` range bias and scale.
+
+A point observed at time t belongs to the latest state at or before it and is carried forward by preintegrated IMU:
+
+    R_t = Exp(-w_ie dt) R_k dR,   v_t = v_k + (g - 2 w_ie x v_k) dt + R_k dv,
+    r_t = r_k + v_k dt + (g - 2 w_ie x v_k) dt^2 / 2 + R_k dp,   a = r_t + R_t l,   v_a = v_t + R_t (w_nb x l)
+
+Perturbation as GTSAM's Pose3: R Exp(dtheta), r + R drho.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import gtsam
+import numpy as np
+
+from factorgraph.attitude import exp_so3, skew
+from factorgraph.geodesy import LocalFrame, centrifugal_ecef
+from factorgraph.measurements import ImuStream
+from factorgraph.models import preintegration
+from factorgraph.models.preintegration import Increments
+from factorgraph.problem import Vehicle
+from factorgraph.types import Array, IntArray
+
+Mode = Literal["imu", "motion", "fixed"]
+NEAR_S = 5e-3  # closer to a state than this, constant velocity carries the point
+_STRIDE = 10_000_000
+
+
+def key(letter: str, vehicle: int, k: int) -> int:
+    """GTSAM key of a vehicle's variable at grid time k."""
+    return int(gtsam.symbol(letter, vehicle * _STRIDE + k))
+
+
+@dataclass(frozen=True, slots=True)
+class Query:
+    """Points of one vehicle at measurement times: state index, time since it, lever arm, increments since it."""
+
+    k: IntArray  # (n,)
+    dt_s: Array  # (n,)
+    lever_b: Array  # (n, 3)
+    increments: Increments | None  # None: constant velocity only
+
+    @property
+    def columns(self) -> int:
+        return 15 if self.increments is not None else 9
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """Observed points and their Jacobians to the local columns (pose 6 or position 3, velocity 3, bias 6)."""
+
+    r_n: Array  # (n, 3)
+    v_n: Array  # (n, 3)
+    J_r: Array  # (n, 3, w)
+    J_v: Array  # (n, 3, w)
+
+
+class VehicleVariables:
+    """One vehicle on the grid: current trajectory, keys, and how points follow from it."""
+
+    def __init__(self, index: int, vehicle: Vehicle, grid_s: Array, frame: LocalFrame, use_imu: bool = True) -> None:
+        K = len(grid_s)
+        self.index, self.name, self.vehicle, self.frame = index, vehicle.name, vehicle, frame
+        self.mode: Mode = "fixed" if vehicle.is_fixed else "imu" if vehicle.imu is not None and use_imu else "motion"
+        self.t_s = grid_s
+        self.r = np.tile(np.asarray(vehicle.fixed_n, float), (K, 1)) if vehicle.fixed_n is not None else np.zeros((K, 3))
+        self.v = np.zeros((K, 3))
+        self.R = np.tile(np.eye(3), (K, 1, 1))
+        self.bias = np.zeros((K, 6))  # gyroscope, accelerometer
+        self.preintegrated_bias = np.zeros((K, 6))
+
+    @property
+    def imu(self) -> ImuStream:
+        assert self.vehicle.imu is not None
+        return self.vehicle.imu
+
+    def keys(self, k: int) -> tuple[int, ...]:
+        """Keys of state k in the order of the local columns."""
+        if self.mode == "imu":
+            return key("x", self.index, k), key("v", self.index, k), key("b", self.index, k)
+        if self.mode == "motion":
+            return key("p", self.index, k), key("v", self.index, k)
+        return ()
+
+    @property
+    def dims(self) -> tuple[int, ...]:
+        return {"imu": (6, 3, 6), "motion": (3, 3), "fixed": ()}[self.mode]
+
+    def query(self, t_s: Array, lever_b: Array | tuple[float, float, float]) -> Query:
+        """Attach times (n,) to states; points within NEAR_S of a state, or of a vehicle without IMU, use its velocity."""
+        t_s = np.asarray(t_s, float)
+        lever = np.broadcast_to(np.asarray(lever_b, float), (len(t_s), 3))
+        if self.mode != "imu":  # nearest state: dt is small, or the vehicle does not move
+            k = np.clip(np.searchsorted(self.t_s, t_s), 1, max(len(self.t_s) - 1, 1))
+            k = np.minimum(np.where(t_s - self.t_s[k - 1] <= self.t_s[np.minimum(k, len(self.t_s) - 1)] - t_s, k - 1, k), len(self.t_s) - 1)
+            return Query(k, t_s - self.t_s[k], lever, None)
+        k = np.clip(np.searchsorted(self.t_s, t_s + NEAR_S, side="right") - 1, 0, len(self.t_s) - 1)
+        dt = t_s - self.t_s[k]
+        if np.all(dt <= NEAR_S):
+            return Query(k, dt, lever, None)
+        return Query(k, dt, lever, self._increments(k, dt))
+
+    def _increments(self, k: IntArray, dt: Array) -> Increments:
+        order = np.lexsort((dt, k))
+        start = self.t_s[k]
+        inc = preintegration.integrate(self.imu, start[order], start[order] + np.maximum(dt[order], 0.0), self.preintegrated_bias[k[order]])
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        return Increments(*(getattr(inc, name)[back] for name in Increments.__dataclass_fields__))
+
+    def refresh(self, query: Query) -> Query:
+        """The same query with increments at the current preintegration bias."""
+        if query.increments is None:
+            return query
+        return Query(query.k, query.dt_s, query.lever_b, self._increments(query.k, query.dt_s))
+
+    def body_rate(self, t_s: Array, k: IntArray) -> Array:
+        """Angular rate of body relative to n (n, 3) at times, from the gyroscope less bias and Earth rate."""
+        i = np.clip(np.searchsorted(self.imu.t_s, t_s), 0, len(self.imu.t_s) - 1)
+        w_ie_b = np.einsum("nji,j->ni", self.R[k], self.frame.w_ie_n)
+        return self.imu.w_b[i] - self.bias[k, :3] - w_ie_b
+
+    def gravity_terms(self, k: IntArray) -> Array:
+        """g - 2 w_ie x v at states k (n, 3)."""
+        return self.frame.gravity(self.r[k]) - 2 * np.cross(self.frame.w_ie_n, self.v[k])
+
+    def points(self, q: Query) -> Point:
+        """Observed points at the current trajectory."""
+        n = len(q.k)
+        if self.mode == "fixed":
+            return Point(self.r[q.k], np.zeros((n, 3)), np.zeros((n, 3, 0)), np.zeros((n, 3, 0)))
+        dt = q.dt_s[:, None]
+        eye = np.broadcast_to(np.eye(3), (n, 3, 3))
+        if self.mode == "motion":
+            J_r, J_v = np.zeros((n, 3, 6)), np.zeros((n, 3, 6))
+            J_r[:, :, :3], J_r[:, :, 3:], J_v[:, :, 3:] = eye, eye * dt[..., None], eye
+            return Point(self.r[q.k] + self.v[q.k] * dt, self.v[q.k], J_r, J_v)
+        R, v = self.R[q.k], self.v[q.k]
+        rate = self.body_rate(self.t_s[q.k] + q.dt_s, q.k)
+        w_l = np.cross(rate, q.lever_b)
+        if q.increments is None:
+            J_r, J_v = np.zeros((n, 3, 9)), np.zeros((n, 3, 9))
+            r = self.r[q.k] + v * dt + np.einsum("nij,nj->ni", R, q.lever_b + w_l * dt)
+            J_r[:, :, :3], J_r[:, :, 3:6], J_r[:, :, 6:] = -R @ skew(q.lever_b), R, eye * dt[..., None]
+            J_v[:, :, :3], J_v[:, :, 6:] = -R @ skew(w_l), eye
+            return Point(r, v + np.einsum("nij,nj->ni", R, w_l), J_r, J_v)
+        inc = q.increments
+        db = self.bias[q.k] - self.preintegrated_bias[q.k]
+        dR = inc.dR @ exp_so3(np.einsum("nij,nj->ni", inc.dR_dbg, db[:, :3]))
+        dv = inc.dv + np.einsum("nij,nj->ni", inc.dv_dbg, db[:, :3]) + np.einsum("nij,nj->ni", inc.dv_dba, db[:, 3:])
+        dp = inc.dp + np.einsum("nij,nj->ni", inc.dp_dbg, db[:, :3]) + np.einsum("nij,nj->ni", inc.dp_dba, db[:, 3:])
+        g = self.gravity_terms(q.k)
+        turn = exp_so3(-self.frame.w_ie_n * dt)
+        Rt = turn @ R @ dR
+        r = self.r[q.k] + v * dt + 0.5 * g * dt**2 + np.einsum("nij,nj->ni", R, dp) + np.einsum("nij,nj->ni", Rt, q.lever_b)
+        vel = v + g * dt + np.einsum("nij,nj->ni", R, dv) + np.einsum("nij,nj->ni", Rt, w_l)
+        lever_k = np.einsum("nij,nj->ni", dR, q.lever_b)
+        J_r, J_v = np.zeros((n, 3, 15)), np.zeros((n, 3, 15))
+        J_r[:, :, :3], J_r[:, :, 3:6], J_r[:, :, 6:9] = -R @ skew(dp + lever_k), R, eye * dt[..., None]
+        J_r[:, :, 9:12] = R @ inc.dp_dba
+        J_r[:, :, 12:15] = R @ inc.dp_dbg - Rt @ skew(q.lever_b) @ inc.dR_dbg
+        J_v[:, :, :3], J_v[:, :, 6:9] = -R @ skew(dv + np.einsum("nij,nj->ni", dR, w_l)), eye
+        J_v[:, :, 9:12] = R @ inc.dv_dba
+        J_v[:, :, 12:15] = R @ inc.dv_dbg - Rt @ skew(w_l) @ inc.dR_dbg + Rt @ skew(q.lever_b)
+        return Point(r, vel, J_r, J_v)
+
+    def insert(self, values: gtsam.Values) -> None:
+        """Put the current trajectory into GTSAM values."""
+        for k in range(len(self.t_s)):
+            if self.mode == "imu":
+                values.insert(key("x", self.index, k), gtsam.Pose3(gtsam.Rot3(self.R[k]), self.r[k]))
+                values.insert(key("b", self.index, k), gtsam.imuBias.ConstantBias(self.bias[k, 3:], self.bias[k, :3]))
+            elif self.mode == "motion":
+                values.insert(key("p", self.index, k), self.r[k])
+            if self.mode != "fixed":
+                values.insert(key("v", self.index, k), self.v[k])
+
+    def extract(self, values: gtsam.Values) -> None:
+        """Take the trajectory from GTSAM values."""
+        for k in range(len(self.t_s)):
+            if self.mode == "imu":
+                pose = values.atPose3(key("x", self.index, k))
+                self.R[k], self.r[k] = pose.rotation().matrix(), pose.translation()
+                b = values.atConstantBias(key("b", self.index, k))
+                self.bias[k, 3:], self.bias[k, :3] = b.accelerometer(), b.gyroscope()
+            elif self.mode == "motion":
+                self.r[k] = values.atVector(key("p", self.index, k))
+            if self.mode != "fixed":
+                self.v[k] = values.atVector(key("v", self.index, k))
+
+    def origin_centrifugal(self) -> Array:
+        """Centrifugal acceleration at the frame's origin (3,), which GTSAM's Coriolis term leaves out."""
+        return self.frame.rotate_from_ecef(centrifugal_ecef(self.frame.origin_ecef))

@@ -1,0 +1,201 @@
+"""Preintegrated inertial measurements between any two times.
+
+Over a short step with constant body rate w and specific force f the increments are exact:
+
+    dR = Exp(w dt),  dv = (I dt + [w x] dt^2 / 2 + [w x]^2 dt^3 / 6) f,  dp = (I dt^2 / 2 + [w x] dt^3 / 6 + [w x]^2 dt^4 / 24) f
+
+and chain as R <- R dR, p <- p + v dt + R dp, v <- v + R dv. Jacobians to the biases follow the same recursion
+(right Jacobian for the rotation). From increments at the edges of a few groups per interval, `gtsam_inputs` derives the
+mean rate and force that make GTSAM's tangent-space Euler step reproduce those increments exactly, so its native factor
+gets 200 Hz accuracy from 40 calls a second.
+
+Source: Forster et al. (2017), sec. VI; Groves (2013), ch. 5, for the constant-rate increments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from factorgraph.measurements import ImuStream
+from factorgraph.types import Array, IntArray
+
+GROUP_S = 0.025
+
+
+@dataclass(frozen=True, slots=True)
+class Increments:
+    """Motion relative to the start of an interval, free of gravity, and its Jacobians to the biases at `bias`."""
+
+    dt_s: Array  # (n,)
+    dR: Array  # (n, 3, 3)
+    dv: Array  # (n, 3)
+    dp: Array  # (n, 3)
+    dR_dbg: Array  # (n, 3, 3) right-trivialised: dR(bg) = dR Exp(dR_dbg dbg)
+    dv_dbg: Array  # (n, 3, 3)
+    dv_dba: Array
+    dp_dbg: Array
+    dp_dba: Array
+    w_b: Array  # (n, 3) angular rate at the end, bias not removed
+
+
+@njit(cache=True)
+def _skew(v):  # type: ignore[no-untyped-def]
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+@njit(cache=True)
+def _exp_and_right_jacobian(phi):  # type: ignore[no-untyped-def]
+    a2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    S = _skew(phi)
+    S2 = S @ S
+    if a2 < 1e-8:
+        s, c, d = 1 - a2 / 6, 0.5 - a2 / 24, 1.0 / 6 - a2 / 120
+    else:
+        a = np.sqrt(a2)
+        s, c, d = np.sin(a) / a, (1 - np.cos(a)) / a2, (a - np.sin(a)) / (a2 * a)
+    return np.eye(3) + s * S + c * S2, np.eye(3) - c * S + d * S2
+
+
+@njit(cache=True)
+def _integrate(edges, f, w, start, stop, bias, dt_out, dR_out, dv_out, dp_out, J_out, w_out):  # type: ignore[no-untyped-def]
+    """Increments over (start[i], stop[i]] for samples holding f[k], w[k] on (edges[k], edges[k + 1]].
+
+    Intervals with equal start and non-decreasing stop continue each other.
+    """
+    n = len(start)
+    n_samples = len(f)
+    dR, dv, dp = np.eye(3), np.zeros(3), np.zeros(3)
+    JR, Jvg, Jva, Jpg, Jpa = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    eye = np.eye(3)
+    t = 0.0
+    k = 0
+    for i in range(n):
+        if i == 0 or start[i] != start[i - 1] or stop[i] < stop[i - 1]:
+            dR, dv, dp = np.eye(3), np.zeros(3), np.zeros(3)
+            JR, Jvg, Jva, Jpg, Jpa = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+            t = start[i]
+            k = min(max(np.searchsorted(edges, t, side="right") - 1, 0), n_samples - 1)
+        while t < stop[i]:
+            end = stop[i]
+            if k < n_samples - 1 and edges[k + 1] < end:
+                end = edges[k + 1]
+            dt = end - t
+            if dt > 0:
+                wk, fk = w[k] - bias[i, :3], f[k] - bias[i, 3:]
+                W = _skew(wk)
+                W2 = W @ W
+                E, Jr = _exp_and_right_jacobian(wk * dt)
+                A1 = eye * dt + W * (dt * dt / 2) + W2 * (dt**3 / 6)
+                A2 = eye * (dt * dt / 2) + W * (dt**3 / 6) + W2 * (dt**4 / 24)
+                RA1, RA2 = dR @ A1, dR @ A2
+                av, ap = A1 @ fk, A2 @ fk
+                F = _skew(fk)
+                # d(A1 f)/dw f-terms: -(dt^2/2)[f x], leading order; exact enough for a first-order bias correction
+                Jpg = Jpg + Jvg * dt - dR @ _skew(ap) @ JR + dR @ F * (dt**3 / 6)
+                Jpa = Jpa + Jva * dt - RA2
+                Jvg = Jvg - dR @ _skew(av) @ JR + dR @ F * (dt * dt / 2)
+                Jva = Jva - RA1
+                JR = E.T @ JR - Jr * dt
+                dp = dp + dv * dt + dR @ ap
+                dv = dv + dR @ av
+                dR = dR @ E
+            t = end
+            if k < n_samples - 1 and t >= edges[k + 1]:
+                k += 1
+        dt_out[i] = stop[i] - start[i]
+        dR_out[i], dv_out[i], dp_out[i] = dR, dv, dp
+        J_out[i, 0], J_out[i, 1], J_out[i, 2], J_out[i, 3], J_out[i, 4] = JR, Jvg, Jva, Jpg, Jpa
+        w_out[i] = w[k]
+
+
+def sample_means(imu: ImuStream) -> tuple[Array, Array, Array]:
+    """Edges (n + 1,) and the mean force and rate (n, 3) between them.
+
+    Instantaneous samples become trapezoidal means; the first sample also covers one interval before itself.
+    """
+    t = imu.t_s
+    first = t[0] - (t[1] - t[0]) if len(t) > 1 else t[0] - 1e-2
+    edges = np.concatenate([[first], t])
+    if imu.is_mean:
+        return edges, np.ascontiguousarray(imu.f_b), np.ascontiguousarray(imu.w_b)
+
+    def trapezoid(x: Array) -> Array:
+        return np.concatenate([x[:1], 0.5 * (x[1:] + x[:-1])])
+
+    return edges, trapezoid(imu.f_b), trapezoid(imu.w_b)
+
+
+def integrate(imu: ImuStream, start_s: Array, stop_s: Array, bias: Array) -> Increments:
+    """Increments over (start, stop] for each interval.
+
+    start_s, stop_s (n,); bias (n, 6) gyroscope then accelerometer. Beyond the recording the outermost sample holds.
+    Consecutive intervals with one start and increasing stops cost no more than the longest.
+    """
+    n = len(start_s)
+    edges, f, w = sample_means(imu)
+    out = Increments(
+        np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)), *(np.zeros((n, 3, 3)) for _ in range(5)), np.zeros((n, 3))
+    )
+    J = np.zeros((n, 5, 3, 3))
+    _integrate(
+        edges, f, w, np.asarray(start_s, float), np.asarray(stop_s, float), np.asarray(bias, float), out.dt_s, out.dR, out.dv, out.dp, J, out.w_b
+    )
+    for k, block in enumerate((out.dR_dbg, out.dv_dbg, out.dv_dba, out.dp_dbg, out.dp_dba)):
+        block[:] = J[:, k]
+    return out
+
+
+@njit(cache=True)
+def _log(R):  # type: ignore[no-untyped-def]
+    tr = R[0, 0] + R[1, 1] + R[2, 2]
+    v = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) * 0.5
+    s = np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+    if s < 1e-9:
+        return v
+    return v * (np.arctan2(s, 0.5 * (tr - 1)) / s)
+
+
+@njit(cache=True)
+def _tangent_inputs(first, dt_s, dR, dv, w_eff, a_eff, dt):  # type: ignore[no-untyped-def]
+    for i in range(len(dt_s)):
+        R0, v0, th0, t0 = np.eye(3), np.zeros(3), np.zeros(3), 0.0
+        if not first[i]:
+            R0, v0, th0, t0 = dR[i - 1], dv[i - 1], _log(dR[i - 1]), dt_s[i - 1]
+        h = dt_s[i] - t0
+        _, Jr = _exp_and_right_jacobian(th0)
+        dt[i] = h
+        w_eff[i] = Jr @ (_log(dR[i]) - th0) / h
+        a_eff[i] = R0.T @ (dv[i] - v0) / h
+
+
+@dataclass(frozen=True, slots=True)
+class GroupedInputs:
+    """Inputs of GTSAM's `integrateMeasurement`: interval i uses rows first[i] : first[i + 1]; bias still in them."""
+
+    first: IntArray  # (n + 1,)
+    f_b: Array  # (m, 3)
+    w_b: Array  # (m, 3)
+    dt_s: Array  # (m,)
+
+
+def gtsam_inputs(imu: ImuStream, start_s: Array, stop_s: Array, bias: Array) -> GroupedInputs:
+    """Grouped mean inputs for the intervals (start, stop], exact at group edges for the given bias (n, 6).
+
+    GTSAM integrates theta <- theta + Jr(theta)^-1 w dt and v <- v + Exp(theta) a dt; w and a are solved from that.
+    """
+    count = np.maximum(1, np.ceil((stop_s - start_s) / GROUP_S - 1e-6)).astype(np.int64)
+    first = np.concatenate([[0], np.cumsum(count)])
+    interval = np.repeat(np.arange(len(count)), count)
+    step = (np.arange(first[-1]) - first[interval] + 1) / count[interval]
+    stops = start_s[interval] + (stop_s - start_s)[interval] * step
+    stops[first[1:] - 1] = stop_s
+    inc = integrate(imu, start_s[interval], stops, bias[interval])
+    m = len(interval)
+    w_eff, a_eff, dt = np.zeros((m, 3)), np.zeros((m, 3)), np.zeros(m)
+    is_first = np.zeros(m, bool)
+    is_first[first[:-1]] = True
+    _tangent_inputs(is_first, inc.dt_s, inc.dR, inc.dv, w_eff, a_eff, dt)
+    return GroupedInputs(first, a_eff + bias[interval, 3:], w_eff + bias[interval, :3], dt)

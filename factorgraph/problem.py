@@ -1,0 +1,211 @@
+"""The navigation problem: everything an estimator may know, and no estimator in it.
+
+A problem is vehicles (sensors, lever arms, noise), links between vehicles (which pairs difference their GNSS
+observations), ranges between tags, and settings. Lever arms run from the body origin to the sensor, in the
+body frame RFU. The IMU is at the body origin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from factorgraph.errors import InputError
+from factorgraph.geodesy import LocalFrame
+from factorgraph.gpstime import GpsTime
+from factorgraph.measurements import GnssStream, HeightStream, ImuStream, PositionStream, RangeStream, Truth
+
+Vec3 = tuple[float, float, float]
+Kernel = Literal["none", "huber", "cauchy", "geman-mcclure", "tukey"]
+
+
+def _positive(owner: object, *names: str) -> None:
+    for name in names:
+        value = getattr(owner, name)
+        if not value > 0:
+            raise InputError(f"{type(owner).__name__}.{name} must be positive, got {value}")
+
+
+@dataclass(frozen=True, slots=True)
+class ImuNoise:
+    """White-noise densities and bias behaviour; defaults are a consumer MEMS unit."""
+
+    gyro_rps_rthz: float = 2e-4
+    accel_mps2_rthz: float = 2e-3
+    gyro_bias_rps: float = 1e-2  # prior standard deviation
+    accel_bias_mps2: float = 0.3
+    gyro_bias_walk_rps_rts: float = 2e-5  # random-walk density, per sqrt(s)
+    accel_bias_walk_mps2_rts: float = 2e-4
+
+    def __post_init__(self) -> None:
+        _positive(self, "gyro_rps_rthz", "accel_mps2_rthz", "gyro_bias_rps", "accel_bias_mps2")
+        _positive(self, "gyro_bias_walk_rps_rts", "accel_bias_walk_mps2_rts")
+
+
+@dataclass(frozen=True, slots=True)
+class GnssNoise:
+    """Zenith standard deviations per receiver; sigma^2(el) = sigma0^2 (1 + 1/sin^2 el) / 2."""
+
+    code_m: float = 0.30
+    phase_m: float = 0.003
+    doppler_mps: float = 0.05
+    absolute_code_m: float = 3.0  # undifferenced: broadcast orbits and clocks, atmosphere
+    absolute_correlation_s: float = 60.0  # those errors persist: code of nearby epochs counts once
+    elevation_mask_rad: float = np.deg2rad(15.0)
+    min_cn0_dbhz: float = 0.0
+
+    def __post_init__(self) -> None:
+        _positive(self, "code_m", "phase_m", "doppler_mps", "absolute_code_m", "absolute_correlation_s")
+
+
+@dataclass(frozen=True, slots=True)
+class MotionPrior:
+    """How a vehicle without an IMU may move: white noise on acceleration [m/s^2/sqrt(Hz)], per axis of n."""
+
+    accel_mps2_rthz: Vec3 = (1.0, 1.0, 0.5)
+
+    def __post_init__(self) -> None:
+        if not min(self.accel_mps2_rthz) > 0:
+            raise InputError(f"MotionPrior.accel_mps2_rthz must be positive, got {self.accel_mps2_rthz}")
+
+
+@dataclass(frozen=True, slots=True)
+class Antenna:
+    """A GNSS antenna and its receiver's observations."""
+
+    stream: GnssStream
+    lever_b: Vec3 = (0.0, 0.0, 0.0)
+    noise: GnssNoise = GnssNoise()
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicle:
+    """A moving vehicle, or a base station when `fixed_n` gives its antenna's known position."""
+
+    name: str
+    imu: ImuStream | None = None
+    imu_noise: ImuNoise = ImuNoise()
+    gnss: Antenna | None = None
+    positions: tuple[PositionStream, ...] = ()
+    heights: tuple[HeightStream, ...] = ()
+    motion: MotionPrior = MotionPrior()
+    fixed_n: Vec3 | None = None
+    truth: Truth | None = None
+    heading_hint_rad: float | None = None  # start heading when no sensor tells
+
+    @property
+    def is_fixed(self) -> bool:
+        return self.fixed_n is not None
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A pair whose GNSS observations are differenced; baseline = rover - reference."""
+
+    reference: str
+    rover: str
+
+
+@dataclass(frozen=True, slots=True)
+class RangeModel:
+    """What else a range set estimates: bias [m] and scale [1] per tag pair or one for all."""
+
+    stream: RangeStream
+    bias_sigma_m: float = 0.0  # prior; 0: not estimated
+    scale_sigma: float = 0.0
+    per_pair: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Robust:
+    """M-estimator of one measurement kind; `width` in standard deviations."""
+
+    kernel: Kernel = "huber"
+    width: float = 1.345
+
+    def __post_init__(self) -> None:
+        _positive(self, "width")
+
+
+@dataclass(frozen=True, slots=True)
+class AmbiguitySettings:
+    """How integers are fixed."""
+
+    fix: bool = True
+    ratio_threshold: float = 3.0
+    min_success_rate: float = 0.999  # of the subset that partial fixing keeps
+    min_arc_epochs: int = 5
+    release_sigma: float = 5.0  # an integer is released when its phase residuals' rms exceeds this many sigma
+    slip_phase_doppler_cyc: float = 3.0  # threshold of the phase-against-Doppler test
+    slip_geometry_free_m: float = 0.05
+
+    def __post_init__(self) -> None:
+        _positive(self, "ratio_threshold", "release_sigma", "slip_phase_doppler_cyc", "slip_geometry_free_m")
+        if not 0 < self.min_success_rate < 1:
+            raise InputError(f"AmbiguitySettings.min_success_rate must lie in (0, 1), got {self.min_success_rate}")
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Choices of the estimation, all with defaults."""
+
+    max_state_interval_s: float = 1.0
+    systems: str = "GREJC"  # constellations used, RINEX letters (GLONASS: code and Doppler only)
+    bands: str = "125678"  # RINEX band digits used
+    use_absolute: bool = True  # undifferenced code and Doppler in the graph
+    ambiguity: AmbiguitySettings = AmbiguitySettings()
+    robust: dict[str, Robust] = field(
+        default_factory=lambda: {
+            "code": Robust("huber", 2.0),
+            "phase": Robust("huber", 2.5),
+            "doppler": Robust("huber", 2.0),
+            "range": Robust("cauchy", 2.0),
+            "position": Robust("huber", 2.0),
+            "height": Robust("huber", 2.0),
+        }
+    )
+    max_iterations: int = 50
+    tolerance: float = 1e-6  # relative decrease of the cost that counts as converged
+    outlier_sigma: float = 4.0  # normalised residuals beyond this are listed
+
+
+@dataclass(frozen=True, slots=True)
+class NavigationProblem:
+    """A flight as estimators see it."""
+
+    name: str
+    t0: GpsTime
+    frame: LocalFrame
+    vehicles: tuple[Vehicle, ...]
+    links: tuple[Link, ...] = ()
+    ranges: tuple[RangeModel, ...] = ()
+    pairs: tuple[Link, ...] = ()  # pairs whose relative solution is wanted; empty: every link, else every pair
+    settings: Settings = field(default_factory=Settings)
+
+    def __post_init__(self) -> None:
+        names = [v.name for v in self.vehicles]
+        doubled = {n for n in names if names.count(n) > 1}
+        if doubled:
+            raise InputError(f"vehicle names must be distinct; repeated: {', '.join(sorted(doubled))}")
+        for link in (*self.links, *self.pairs):
+            for end in (link.reference, link.rover):
+                if end not in names:
+                    raise InputError(f"link {link.reference}-{link.rover}: no vehicle named {end}; there are {', '.join(names)}")
+        for model in self.ranges:
+            for tag in model.stream.tags:
+                if tag.vehicle is not None and tag.vehicle not in names:
+                    raise InputError(f"tag {tag.name}: no vehicle named {tag.vehicle}; there are {', '.join(names)}")
+
+    def vehicle(self, name: str) -> Vehicle:
+        return next(v for v in self.vehicles if v.name == name)
+
+    @property
+    def wanted_pairs(self) -> tuple[Link, ...]:
+        if self.pairs:
+            return self.pairs
+        if self.links:
+            return self.links
+        names = [v.name for v in self.vehicles]
+        return tuple(Link(a, b) for i, a in enumerate(names) for b in names[i + 1 :])

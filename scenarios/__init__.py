@@ -1,0 +1,1 @@
+"""Flights and their readers, simulators, reports and the command line."""

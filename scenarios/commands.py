@@ -1,0 +1,269 @@
+"""What the commands do, after parsing: load, call, write, tell.
+
+Results go to stdout, progress and remarks to stderr. Every result is complete or absent: it is written beside its
+place and then moved there, so an interrupted run or a full disk leaves what was finished before. Heavy rooms are
+imported where they are used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from factorgraph import registry
+from factorgraph.measurements import ReadReport
+from factorgraph.solution import Solution, Status
+from scenarios import guard
+from scenarios.cli import check_writable, describe_os_error
+from scenarios.overrides import override
+
+PIPE_WIDTH = 100  # columns of a table that is not read on a terminal
+
+
+class Outputs:
+    """A folder of results and what was finished in it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.finished: list[Path] = []
+
+    def write(self, name: str, writer: Callable[[Path], object]) -> Path:
+        """Let `writer` write a file or folder beside its place, then move it there."""
+        path, part = self.folder / name, self.folder / f".part-{name}"
+        self.folder.mkdir(parents=True, exist_ok=True)
+        _remove(part)
+        try:
+            writer(part)
+            _remove(path)
+            part.replace(path)
+        finally:
+            _remove(part)
+        self.finished.append(path)
+        return path
+
+    @property
+    def state(self) -> str:
+        """What an early end leaves behind."""
+        return f"results so far are in {self.folder}" if self.finished else "nothing is written yet"
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+class Stages:
+    """Progress: a bar on stderr when that is a terminal, and a note of each stage to the guard."""
+
+    def __init__(self, trace: guard.Trace | None = None) -> None:
+        self._trace = trace
+        self._noted = ""
+        self._console = Console(stderr=True)
+        columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False))
+        self._bar = Progress(*columns, console=self._console, transient=True, disable=not self._console.is_terminal)
+        self._task = self._bar.add_task("", total=None)
+
+    def __enter__(self) -> Stages:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def __call__(self, stage: str, fraction: float | None = None) -> None:
+        """Show a stage ("name" or "name: detail") and the fraction done in [0, 1]; None where it is not known."""
+        name = stage.partition(":")[0]
+        if self._trace is not None and name != self._noted:
+            self._trace.stage(name)
+            self._noted = name
+        if fraction is None:
+            self._bar.update(self._task, description=stage, total=None)
+        else:
+            self._bar.update(self._task, description=stage, total=1.0, completed=fraction)
+
+    def say(self, text: str) -> None:
+        """A remark on stderr."""
+        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def _early_end(outputs: Outputs) -> Iterator[None]:
+    """Adds to an interrupt or a file system error what is left behind."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise guard.Stopped(guard.INTERRUPTED, f"stopped; {outputs.state}") from None
+    except OSError as error:
+        raise guard.Stopped(guard.FAILED, f"error: {describe_os_error(error)}; {outputs.state}") from error
+
+
+def smooth(args: argparse.Namespace) -> int:
+    """Estimate a flight and write solution, trajectories, summary and report."""
+    outputs = Outputs(args.out)
+    with _early_end(outputs), Stages(args.trace) as stages:
+        solution = _estimate(args, stages)
+        _write_results(solution, outputs, stages, args)
+    _print_summary(solution)
+    return _outcome(solution, outputs, stages)
+
+
+def _estimate(args: argparse.Namespace, stages: Stages) -> Solution:
+    stages("loading the engine")
+    registry.create(args.method)  # an unknown method is told before the files are read
+    stages("reading the flight")
+    from scenarios.flights import load
+
+    flight = load(args.flight, args.data)
+    for report in flight.reports:
+        _tell_dropped(report, stages)
+    problem = dataclasses.replace(flight.problem, settings=override(flight.problem.settings, args.set))
+    stages("solving")
+    return registry.solve(problem, args.method, stages)
+
+
+def _tell_dropped(report: ReadReport, stages: Stages) -> None:
+    reasons = ", ".join(f"{n} {reason}" for reason, n in report.dropped.items() if n)
+    if reasons:
+        stages.say(f"{report.source}: {report.n_rows} rows used, dropped {reasons}")
+    for note in report.notes:
+        stages.say(f"{report.source}: {note}")
+
+
+def _write_results(solution: Solution, outputs: Outputs, stages: Stages, args: argparse.Namespace) -> None:
+    from scenarios import solutions
+
+    stages("writing the results")
+    outputs.write("solution", lambda path: solutions.save(solution, path))
+    outputs.write("summary.json", lambda path: path.write_text(json.dumps(summary(solution), indent=1) + "\n", encoding="utf-8"))
+    if not args.no_report:
+        stages("writing the report")
+        _write_report(solution, outputs)
+    if args.figures:
+        stages("drawing the figures")
+        _write_figures(solution, outputs)
+
+
+def _write_report(solution: Solution, outputs: Outputs) -> None:
+    from scenarios.report.page import write_report
+
+    outputs.write("report.html", lambda path: write_report(solution, path))
+
+
+def _write_figures(solution: Solution, outputs: Outputs) -> None:
+    from scenarios.report.figures import write_figures
+
+    outputs.write("figures", lambda path: write_figures(solution, path))
+
+
+def summary(solution: Solution) -> dict[str, object]:
+    """The summary as plain JSON types; numbers that are not known are null."""
+    from scenarios.metrics import summary_rows
+
+    rows = [
+        {**dataclasses.asdict(r), "value": r.value if math.isfinite(r.value) else None, "text": r.text}
+        for r in summary_rows(solution)
+    ]
+    diagnostics = solution.diagnostics
+    return {
+        "name": solution.name,
+        "method": solution.method,
+        "status": diagnostics.status.value,
+        "degraded": solution.is_degraded,
+        "warnings": list(diagnostics.warnings),
+        "rows": rows,
+    }
+
+
+def _print_summary(solution: Solution) -> None:
+    from scenarios.metrics import summary_rows
+
+    table = Table(title=f"{solution.name}, method {solution.method}", title_justify="left", header_style="bold")
+    table.add_column("of")
+    table.add_column("what")
+    table.add_column("value", justify="right")
+    rows = summary_rows(solution)
+    for i, row in enumerate(rows):
+        first = i == 0 or rows[i - 1].subject != row.subject
+        if first and i:
+            table.add_section()
+        table.add_row(row.subject if first else "", row.quantity, row.text)
+    stdout_console().print(table)
+
+
+def stdout_console() -> Console:
+    """A console for results: as wide as the terminal, or PIPE_WIDTH."""
+    return Console(width=None if sys.stdout.isatty() else PIPE_WIDTH)
+
+
+def _outcome(solution: Solution, outputs: Outputs, stages: Stages) -> int:
+    """Say what was written and whether it can be trusted; the exit code."""
+    for path in outputs.finished:
+        print(f"{path.name:<14} {path}")
+    for warning in solution.diagnostics.warnings:
+        stages.say(f"relnav: degraded: {warning}")
+    status = solution.diagnostics.status
+    if status is Status.INTERRUPTED:
+        stages.say(f"relnav: stopped; {outputs.state}")
+        return guard.INTERRUPTED
+    if status is not Status.CONVERGED:
+        stages.say(f"relnav: degraded: {status.value} after {solution.diagnostics.n_iterations} iterations")
+    return guard.DEGRADED if solution.is_degraded else guard.DONE
+
+
+def simulate(args: argparse.Namespace) -> int:
+    """Write a simulated flight folder."""
+    from scenarios.simulate import load_scenario
+    from scenarios.simulate import simulate as run
+    from scenarios.simulate.write import write_flight
+
+    with Stages(args.trace) as stages:
+        stages("simulating")
+        flight = run(load_scenario(args.scenario), args.seed)
+        stages("writing the flight")
+        write_flight(flight, args.out)
+    print(f"{args.out / 'flight.toml'}\nnow: relnav smooth {args.out}")
+    return guard.DONE
+
+
+def report(args: argparse.Namespace) -> int:
+    """Write the reports of saved solutions again."""
+    from scenarios import solutions
+
+    code = guard.DONE
+    for folder in args.solutions:
+        outputs = Outputs(folder.parent if folder.name == "solution" else folder)
+        check_writable(outputs.folder)
+        with _early_end(outputs), Stages() as stages:
+            stages(f"reading {folder}")
+            solution = solutions.load(outputs.folder / "solution")
+            stages("writing the report")
+            _write_report(solution, outputs)
+            if args.figures:
+                stages("drawing the figures")
+                _write_figures(solution, outputs)
+        code = max(code, _outcome(solution, outputs, stages))
+    return code
+
+
+def methods(args: argparse.Namespace) -> int:
+    """List the estimators."""
+    table = Table(box=None, header_style="bold")
+    for column in ("method", "what it is", "where"):
+        table.add_column(column, overflow="fold")
+    for info in registry.methods().values():
+        table.add_row(info.name, info.summary, info.path)
+    stdout_console().print(table)
+    return guard.DONE

@@ -1,0 +1,1 @@
+"""Flight folders: schema, readers and writers."""

@@ -1,0 +1,644 @@
+"""`flight.toml`: what a flight folder declares, checked key by key.
+
+    [flight]     name, t0, origin, where the files are, part of the recording to use
+    [[vehicle]]  name, body axes, imu, imu_noise, gnss, positions, heights, motion, fixed, truth
+    [[range]]    a set of ranges between tags
+    [[link]]     a pair whose GNSS observations are differenced
+    [[pair]]     a pair whose relative solution is wanted
+    [settings]   the fields of `factorgraph.problem.Settings`
+
+Units are in the key names or declared beside the columns; axes are declared, never guessed. Columns are given by
+name or by number from 0. Unknown keys are errors that name the nearest known one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+import math
+import tomllib
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_type_hints
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    PositiveFloat,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from factorgraph.attitude import matrix_from_euler
+from factorgraph.errors import InputError
+from factorgraph.geodesy import LocalFrame, ecef_from_geodetic
+from factorgraph.gpstime import GpsTime
+from factorgraph.problem import GnssNoise, ImuNoise, MotionPrior, Settings, Vec3
+from factorgraph.types import Array
+
+FILE_NAME = "flight.toml"
+STANDARD_GRAVITY = 9.80665  # m/s^2 per g
+
+AxisFrame = Literal["local", "ned", "ecef", "llh"]  # local: the flight's x, y, z-up; llh: degrees, degrees, metres
+Epoch = Literal["flight", "sow", "gps", "unix", "unix-gpst", "iso-gpst", "iso-utc"]
+
+
+def _column(value: object) -> str | int:
+    if isinstance(value, bool) or not isinstance(value, str | int) or (isinstance(value, int) and value < 0):
+        raise PydanticCustomError("column", "a column is a name or a number from 0, got {value}", {"value": repr(value)})
+    return value
+
+
+Column = Annotated[str | int, PlainValidator(_column)]
+Columns3 = tuple[Column, Column, Column]
+
+
+def _two_or_three(columns: tuple[str | int, ...]) -> tuple[str | int, ...]:
+    if len(columns) not in (2, 3):
+        raise InputError(f"name two or three columns, got {len(columns)}")
+    return columns
+
+
+def axes_matrix(axes: str) -> Array:
+    """Rotation (3, 3) from axes named by three letters of R/L, F/B, U/D (one of each) to right-front-up.
+
+    Raises InputError for other letters, a direction named twice, or a left-handed set.
+    """
+    unit = {"R": (1, 0, 0), "L": (-1, 0, 0), "F": (0, 1, 0), "B": (0, -1, 0), "U": (0, 0, 1), "D": (0, 0, -1)}
+    if len(axes) != 3 or any(letter not in unit for letter in axes):
+        raise InputError(f'axes "{axes}": write three of R L F B U D, for instance "RFU", "FRD" or "FLU"')
+    C = np.column_stack([unit[letter] for letter in axes]).astype(float)
+    if np.linalg.det(C) < 0.5:
+        kind = "name one direction twice" if abs(np.linalg.det(C)) < 0.5 else "are left-handed"
+        raise InputError(f'axes "{axes}" {kind}; usual sets are "RFU", "FRD" and "FLU"')
+    return C
+
+
+def _check_axes(axes: str) -> str:
+    axes_matrix(axes)
+    return axes
+
+
+Axes = Annotated[str, AfterValidator(_check_axes)]
+
+
+def _read_t0(value: object) -> GpsTime:
+    if isinstance(value, GpsTime):
+        return value
+    if isinstance(value, Mapping) and set(value) == {"week", "sow"}:
+        return GpsTime(int(value["week"]), float(value["sow"]))
+    if isinstance(value, str):
+        try:
+            value = datetime.fromisoformat(value)
+        except ValueError:
+            pass
+    if isinstance(value, datetime):
+        if value.tzinfo is not None:
+            raise PydanticCustomError("t0", "t0 is GPST: write it without a time zone", {})
+        delta = value.replace(tzinfo=UTC)
+        second = delta.second + delta.microsecond * 1e-6
+        return GpsTime.from_calendar(delta.year, delta.month, delta.day, delta.hour, delta.minute, second)
+    raise PydanticCustomError("t0", 'write t0 as "2021-09-22T06:30:00" (GPST) or as week and sow', {})
+
+
+def _write_t0(t0: GpsTime) -> dict[str, float]:
+    return {"week": t0.week, "sow": t0.sow}
+
+
+T0 = Annotated[GpsTime, PlainValidator(_read_t0), PlainSerializer(_write_t0)]
+
+
+class Table(BaseModel):
+    """A table of `flight.toml`: frozen, finite numbers, unknown keys refused with the nearest known one."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, values: Any) -> Any:
+        if isinstance(values, Mapping):
+            known = {field.alias or name for name, field in cls.model_fields.items()}
+            for key in values:
+                if key not in known:
+                    hint = nearest_hint(key, sorted(known))
+                    raise PydanticCustomError("key", "unknown key {key}{hint}", {"key": str(key), "hint": hint})
+        return values
+
+
+def nearest_hint(name: str, known: list[str]) -> str:
+    """ "; did you mean …?" with the nearest known name, else what there is."""
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"; did you mean {near[0]}?" if near else f"; there are {', '.join(known)}"
+
+
+def _time_shorthand(value: object) -> object:
+    return {"column": value} if isinstance(value, str | int) else value
+
+
+class TimeColumn(Table):
+    """Where times are and what they count: t = scale * unit * cell + offset_s, from the epoch."""
+
+    column: Column = 0
+    unit: Literal["s", "ms", "us", "ns"] = "s"
+    scale: float = 1.0
+    offset_s: float = 0.0
+    epoch: Epoch = "flight"
+
+
+Time = Annotated[TimeColumn, BeforeValidator(_time_shorthand)]
+
+
+class Origin(Table):
+    """Origin of the local frame; `heading_deg` turns the recording's y axis clockwise from north."""
+
+    lat_deg: float = Field(ge=-90, le=90)
+    lon_deg: float = Field(ge=-360, le=360)
+    h_m: float = 0.0
+    heading_deg: float = 0.0
+
+    @property
+    def frame(self) -> LocalFrame:
+        return LocalFrame(math.radians(self.lat_deg), math.radians(self.lon_deg), self.h_m)
+
+    @property
+    def C_nl(self) -> Array:
+        """Rotation (3, 3) from the recording's local axes to east-north-up."""
+        return matrix_from_euler(0.0, 0.0, math.radians(self.heading_deg))
+
+
+class FlightInfo(Table):
+    """Name, time, place and files of the flight."""
+
+    name: str = ""
+    summary: str = ""
+    t0: T0 | None = None  # default: first GNSS epoch, else the smallest time
+    origin: Origin | None = None  # default: the base, else the first receiver's approximate position
+    data: str = ""  # folder of the files, relative to flight.toml or to the package
+    package: str = ""  # installed package that brings the files
+    start_s: float = -math.inf
+    end_s: float = math.inf
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True)
+
+
+class TextOptions(Table):
+    """How columns are read from delimited text, or from a variable of a MATLAB file."""
+
+    delimiter: str = ","  # one character, or "whitespace": any run of blanks
+    header: bool = True
+    skip_rows: int = Field(default=0, ge=0)  # lines before the header or the first row
+    comment: str = ""  # lines that start with it are left out
+    variable: str = ""  # of the MATLAB file
+
+
+class Mounting(Table):
+    """Rotation from the sensor's axes (as named by `axes`) to the body: Euler angles or a matrix to right-front-up."""
+
+    rpy_deg: Vec3 | None = None  # roll, pitch, yaw, applied in the order yaw, pitch, roll
+    matrix: tuple[Vec3, Vec3, Vec3] | None = None
+
+    @model_validator(mode="after")
+    def _is_rotation(self) -> Mounting:
+        if self.matrix is not None:
+            C = np.array(self.matrix)
+            if self.rpy_deg is not None or np.abs(C @ C.T - np.eye(3)).max() > 1e-3 or np.linalg.det(C) < 0:
+                raise InputError("mounting: give either rpy_deg or a right-handed rotation matrix")
+        return self
+
+    @property
+    def C(self) -> Array:
+        """The rotation (3, 3)."""
+        if self.matrix is not None:
+            U, _, Vt = np.linalg.svd(np.array(self.matrix))
+            return np.asarray(U @ Vt)
+        roll, pitch, yaw = np.radians(self.rpy_deg or (0.0, 0.0, 0.0))
+        return matrix_from_euler(pitch, roll, yaw)
+
+
+class Imu(TextOptions):
+    """Specific force and angular rate."""
+
+    file: str
+    format: Literal["csv", "mat"] = "csv"
+    time: Time = TimeColumn()
+    accel: Columns3 = (1, 2, 3)
+    gyro: Columns3 = (4, 5, 6)
+    accel_unit: Literal["m/s2", "g"] = "m/s2"
+    gyro_unit: Literal["rad/s", "deg/s"] = "rad/s"
+    axes: Axes = "RFU"
+    mounting: Mounting = Mounting()
+    is_mean: bool = False  # samples are means over the past interval
+    lever_b: Vec3 = (0.0, 0.0, 0.0)  # from the origin of the other lever arms
+
+    @property
+    def C_bs(self) -> Array:
+        """Rotation (3, 3) from the columns' axes to right-front-up."""
+        return self.mounting.C @ axes_matrix(self.axes)
+
+
+_DEG, _HOUR = math.pi / 180, 3600.0
+# key of the file -> field of ImuNoise, factor to SI (spec common.md, section 4)
+IMU_NOISE_UNITS: dict[str, tuple[str, float]] = {
+    "gyro_rps_rthz": ("gyro_rps_rthz", 1.0),
+    "gyro_dps_rthz": ("gyro_rps_rthz", _DEG),
+    "gyro_deg_h_rthz": ("gyro_rps_rthz", _DEG / _HOUR),
+    "gyro_deg_rth": ("gyro_rps_rthz", _DEG / 60),
+    "accel_mps2_rthz": ("accel_mps2_rthz", 1.0),
+    "accel_mg_rthz": ("accel_mps2_rthz", 1e-3 * STANDARD_GRAVITY),
+    "accel_ug_rthz": ("accel_mps2_rthz", 1e-6 * STANDARD_GRAVITY),
+    "accel_mps_rth": ("accel_mps2_rthz", 1 / 60),
+    "gyro_bias_rps": ("gyro_bias_rps", 1.0),
+    "gyro_bias_dps": ("gyro_bias_rps", _DEG),
+    "gyro_bias_deg_h": ("gyro_bias_rps", _DEG / _HOUR),
+    "accel_bias_mps2": ("accel_bias_mps2", 1.0),
+    "accel_bias_mg": ("accel_bias_mps2", 1e-3 * STANDARD_GRAVITY),
+    "accel_bias_ug": ("accel_bias_mps2", 1e-6 * STANDARD_GRAVITY),
+    "gyro_bias_walk_rps_rts": ("gyro_bias_walk_rps_rts", 1.0),
+    "gyro_bias_walk_dps_rts": ("gyro_bias_walk_rps_rts", _DEG),
+    "gyro_bias_walk_deg_h_rts": ("gyro_bias_walk_rps_rts", _DEG / _HOUR),
+    "accel_bias_walk_mps2_rts": ("accel_bias_walk_mps2_rts", 1.0),
+    "accel_bias_walk_mg_rts": ("accel_bias_walk_mps2_rts", 1e-3 * STANDARD_GRAVITY),
+    "accel_bias_walk_ug_rts": ("accel_bias_walk_mps2_rts", 1e-6 * STANDARD_GRAVITY),
+}
+
+
+class ImuNoiseTable(Table):
+    """Noise of the IMU: SI or the units of data sheets, one key per quantity."""
+
+    gyro_rps_rthz: PositiveFloat | None = None
+    gyro_dps_rthz: PositiveFloat | None = None
+    gyro_deg_h_rthz: PositiveFloat | None = None
+    gyro_deg_rth: PositiveFloat | None = None
+    accel_mps2_rthz: PositiveFloat | None = None
+    accel_mg_rthz: PositiveFloat | None = None
+    accel_ug_rthz: PositiveFloat | None = None
+    accel_mps_rth: PositiveFloat | None = None
+    gyro_bias_rps: PositiveFloat | None = None
+    gyro_bias_dps: PositiveFloat | None = None
+    gyro_bias_deg_h: PositiveFloat | None = None
+    accel_bias_mps2: PositiveFloat | None = None
+    accel_bias_mg: PositiveFloat | None = None
+    accel_bias_ug: PositiveFloat | None = None
+    gyro_bias_walk_rps_rts: PositiveFloat | None = None
+    gyro_bias_walk_dps_rts: PositiveFloat | None = None
+    gyro_bias_walk_deg_h_rts: PositiveFloat | None = None
+    accel_bias_walk_mps2_rts: PositiveFloat | None = None
+    accel_bias_walk_mg_rts: PositiveFloat | None = None
+    accel_bias_walk_ug_rts: PositiveFloat | None = None
+
+    @model_validator(mode="after")
+    def _once(self) -> ImuNoiseTable:
+        given: dict[str, str] = {}
+        for key, (name, _) in IMU_NOISE_UNITS.items():
+            if getattr(self, key) is not None and given.setdefault(name, key) != key:
+                raise InputError(f"{given[name]} and {key} state the same quantity; keep one")
+        return self
+
+    @property
+    def noise(self) -> ImuNoise:
+        """In SI units; what is not given keeps its default."""
+        values = {n: getattr(self, k) * factor for k, (n, factor) in IMU_NOISE_UNITS.items() if getattr(self, k) is not None}
+        return ImuNoise(**values)
+
+
+class GnssNoiseTable(Table):
+    """Zenith standard deviations of a receiver; see `factorgraph.problem.GnssNoise`."""
+
+    code_m: PositiveFloat | None = None
+    phase_m: PositiveFloat | None = None
+    doppler_mps: PositiveFloat | None = None
+    absolute_code_m: PositiveFloat | None = None
+    absolute_correlation_s: PositiveFloat | None = None
+    elevation_mask_deg: float | None = Field(default=None, ge=0, lt=90)
+    min_cn0_dbhz: float | None = None
+
+    @property
+    def noise(self) -> GnssNoise:
+        """In SI units; what is not given keeps its default."""
+        values = {k: v for k, v in self.model_dump(exclude_none=True).items() if k != "elevation_mask_deg"}
+        if self.elevation_mask_deg is not None:
+            values["elevation_mask_rad"] = math.radians(self.elevation_mask_deg)
+        return GnssNoise(**values)
+
+
+def _as_list(value: object) -> object:
+    return [value] if isinstance(value, str) else value
+
+
+Files = Annotated[tuple[str, ...], BeforeValidator(_as_list)]
+
+
+class Gnss(Table):
+    """A receiver: RINEX observations and the navigation messages to use with them."""
+
+    obs: str
+    nav: Files = ()  # default: the navigation files of the other receivers
+    lever_b: Vec3 = (0.0, 0.0, 0.0)
+    noise: GnssNoiseTable = GnssNoiseTable()
+
+
+class Positions(TextOptions):
+    """Position fixes of an antenna."""
+
+    file: str
+    format: Literal["csv", "mat", "rtklib-pos", "nmea"] = "csv"
+    name: str = "position"
+    time: Time = TimeColumn()
+    position: Columns3 = (1, 2, 3)
+    frame: AxisFrame = "local"
+    sigma: Columns3 | None = None  # columns, per axis of east-north-up
+    sigma_m: Vec3 | None = None  # default: the file's own, else 3, 3, 6 m
+    date: str = ""  # of an NMEA file without dates: "2021-09-22" (UTC)
+    lever_b: Vec3 = (0.0, 0.0, 0.0)
+
+
+class Heights(TextOptions):
+    """Up coordinate: up = scale * cell + offset_m, or a constant without a file."""
+
+    file: str = ""
+    format: Literal["csv", "mat"] = "csv"
+    name: str = "height"
+    time: Time = TimeColumn()
+    height: Column = 1
+    scale: float = 1.0
+    offset_m: float = 0.0
+    ellipsoidal: bool = False  # heights above the ellipsoid rather than above the local origin
+    constant_m: float | None = None
+    interval_s: PositiveFloat = 1.0  # of the constant; files are thinned by `min_interval_s`
+    min_interval_s: float = Field(default=0.0, ge=0)
+    valid_min: float = -math.inf  # cells outside are dropped: a range finder has limits
+    valid_max: float = math.inf
+    sigma_m: PositiveFloat = 1.0
+    lever_b: Vec3 = (0.0, 0.0, 0.0)
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True)
+
+    @model_validator(mode="after")
+    def _file_or_constant(self) -> Heights:
+        if bool(self.file) == (self.constant_m is not None):
+            raise InputError("heights: give either file or constant_m")
+        return self
+
+
+class TruthTable(TextOptions):
+    """Reference trajectory of the vehicle's lever-arm origin."""
+
+    file: str
+    format: Literal["csv", "mat", "rtklib-pos", "nmea"] = "csv"
+    time: Time = TimeColumn()
+    position: Annotated[tuple[Column, ...], AfterValidator(_two_or_three)] = (1, 2, 3)  # two columns: up is 0
+    velocity: Columns3 | None = None
+    quaternion: tuple[Column, Column, Column, Column] | None = None  # the vehicle's axes to `frame`
+    quaternion_order: Literal["wxyz", "xyzw"] = "wxyz"
+    frame: AxisFrame = "local"
+    date: str = ""
+
+    @model_validator(mode="after")
+    def _attitude_frame(self) -> TruthTable:
+        if self.quaternion is not None and self.frame not in ("local", "ned"):
+            raise InputError(f"truth: attitudes are read with frame local or ned, not {self.frame}")
+        return self
+
+
+class Motion(Table):
+    """How a vehicle without an IMU may move."""
+
+    accel_mps2_rthz: Vec3
+
+    @property
+    def prior(self) -> MotionPrior:
+        return MotionPrior(self.accel_mps2_rthz)
+
+
+class Fixed(Table):
+    """Known antenna position of a base station, one of three ways."""
+
+    ecef_m: Vec3 | None = None
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    h_m: float | None = None
+    local_m: Vec3 | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Fixed:
+        geodetic = [v is not None for v in (self.lat_deg, self.lon_deg, self.h_m)]
+        ways = (self.ecef_m is not None) + (self.local_m is not None) + any(geodetic)
+        if ways != 1 or any(geodetic) != all(geodetic):
+            raise InputError("fixed: give ecef_m, or lat_deg with lon_deg and h_m, or local_m")
+        return self
+
+    @property
+    def ecef(self) -> Array | None:
+        """ECEF position (3,), None when it is given in the local frame."""
+        if self.ecef_m is not None:
+            return np.array(self.ecef_m)
+        if self.lat_deg is None or self.lon_deg is None or self.h_m is None:
+            return None
+        return ecef_from_geodetic(math.radians(self.lat_deg), math.radians(self.lon_deg), self.h_m)
+
+
+class VehicleTable(Table):
+    """A vehicle, or a base station with `fixed`."""
+
+    name: str
+    axes: Axes = "RFU"  # of its lever arms and truth attitudes
+    imu: Imu | None = None
+    imu_noise: ImuNoiseTable = ImuNoiseTable()
+    gnss: Gnss | None = None
+    positions: tuple[Positions, ...] = ()
+    heights: tuple[Heights, ...] = ()
+    motion: Motion | None = None
+    fixed: Fixed | None = None
+    truth: TruthTable | None = None
+    heading_hint_deg: float | None = None
+
+
+class TagTable(Table):
+    """A ranging radio, named as in the file: on a vehicle or an anchor at a local position."""
+
+    name: str
+    vehicle: str | None = None
+    lever_b: Vec3 = (0.0, 0.0, 0.0)
+    position_m: Vec3 | None = None
+
+    @model_validator(mode="after")
+    def _carried_or_anchor(self) -> TagTable:
+        if (self.vehicle is None) == (self.position_m is None):
+            raise InputError(f"tag {self.name}: give either vehicle (with lever_b) or position_m (an anchor)")
+        return self
+
+
+class Ranges(TextOptions):
+    """Ranges between tags, from one file or several with the same columns: range = scale * cell + offset_m."""
+
+    name: str = "uwb"
+    files: Files
+    format: Literal["csv", "mat"] = "csv"
+    time: Time = TimeColumn()
+    range: Column = "range"
+    tag_a: Column = "from_id"
+    tag_b: Column = "to_id"
+    scale: float = 1.0
+    offset_m: float = 0.0
+    sigma: Column | None = None
+    sigma_m: PositiveFloat = 0.15
+    tags: tuple[TagTable, ...]
+    bias_sigma_m: float = Field(default=0.0, ge=0)
+    scale_sigma: float = Field(default=0.0, ge=0)
+    per_pair: bool = False
+
+
+class LinkTable(Table):
+    """A pair of vehicles; baseline = rover - reference."""
+
+    reference: str
+    rover: str
+
+
+def _check_settings(tree: object) -> dict[str, Any]:
+    if not isinstance(tree, dict):
+        raise PydanticCustomError("settings", "[settings] is a table", {})
+    _replaced(Settings(), tree, "")
+    return tree
+
+
+def _replaced(owner: Any, tree: dict[str, Any], path: str) -> Any:
+    """A copy of a settings dataclass or dictionary with the entries of a tree."""
+    is_table = isinstance(owner, dict)
+    children = owner if is_table else {f.name: getattr(owner, f.name) for f in dataclasses.fields(owner)}
+    changes: dict[str, Any] = {}
+    for name, value in tree.items():
+        if name not in children:
+            raise InputError(f"unknown key {path}{name}{nearest_hint(name, sorted(children))}")
+        child = children[name]
+        if isinstance(child, dict) or dataclasses.is_dataclass(child):
+            if not isinstance(value, dict):
+                raise InputError(f"{path}{name} is a table of {', '.join(_names(child))}")
+            changes[name] = _replaced(child, value, f"{path}{name}.")
+        else:
+            changes[name] = _leaf(get_type_hints(type(owner))[name], value, path + name)
+    return {**owner, **changes} if is_table else dataclasses.replace(owner, **changes)
+
+
+def _names(owner: Any) -> list[str]:
+    return list(owner) if isinstance(owner, dict) else [f.name for f in dataclasses.fields(owner)]
+
+
+def _leaf(hint: Any, value: object, path: str) -> Any:
+    try:
+        return TypeAdapter(hint, config=ConfigDict(allow_inf_nan=False)).validate_python(value)
+    except ValidationError as error:
+        raise InputError(f"{path}: {_message(error.errors()[0])}") from error
+
+
+class Flight(Table):
+    """A whole `flight.toml`."""
+
+    flight: FlightInfo = FlightInfo()
+    vehicle: tuple[VehicleTable, ...] = Field(min_length=1)
+    range: tuple[Ranges, ...] = ()
+    link: tuple[LinkTable, ...] = ()
+    pair: tuple[LinkTable, ...] = ()
+    settings: Annotated[dict[str, Any], PlainValidator(_check_settings)] = Field(default_factory=dict)
+
+    @property
+    def problem_settings(self) -> Settings:
+        """The settings with the file's changes applied to the defaults."""
+        settings: Settings = _replaced(Settings(), self.settings, "")
+        return settings
+
+
+def parse(text: str, source: str = FILE_NAME) -> Flight:
+    """Read the text of a `flight.toml`. Raises InputError naming `source`, the dotted key and what would help."""
+    try:
+        tree = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{source}: {error}") from error
+    try:
+        return Flight.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = dotted(first["loc"])
+        raise InputError(f"{source}: {where + ': ' if where else ''}{_message(first)}") from error
+
+
+def read(path: Path) -> Flight:
+    """Read a `flight.toml`. Raises InputError for a missing, unreadable or wrong file."""
+    try:
+        return parse(path.read_text(encoding="utf-8"), str(path))
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not UTF-8 text (byte {error.start})") from error
+
+
+def dotted(location: tuple[int | str, ...]) -> str:
+    """A pydantic location as a dotted key: ("vehicle", 0, "imu", "axes") is vehicle[0].imu.axes."""
+    text = ""
+    for part in location:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
+    return text
+
+
+def _message(error: Any) -> str:
+    if error["type"] == "missing":
+        return "this key is needed"
+    text = str(error["msg"]).removeprefix("Value error, ")
+    value = error.get("input")
+    shows_value = error["type"] not in ("key", "column", "t0", "value_error", "settings") and isinstance(value, str | int | float)
+    return f"{text}, got {value!r}" if shows_value else text
+
+
+def dump(flight: Flight) -> str:
+    """The text of a `flight.toml` that `parse` reads back to an equal model; defaults are left out."""
+    tree = flight.model_dump(mode="python", exclude_defaults=True, exclude_none=True)
+    return "\n".join(_table_lines("", tree)).strip() + "\n"
+
+
+def _table_lines(prefix: str, tree: Mapping[str, Any]) -> Iterator[str]:
+    """Lines of a table: its values first, then its sub-tables under their own headings."""
+    values = {k: v for k, v in tree.items() if not _is_headed(v, prefix)}
+    for key, value in values.items():
+        yield f"{_key(key)} = {_value(value)}"
+    for key, value in tree.items():
+        if key in values:
+            continue
+        path = f"{prefix}.{_key(key)}" if prefix else _key(key)
+        heading = f"[{path}]" if isinstance(value, Mapping) else f"[[{path}]]"
+        for item in [value] if isinstance(value, Mapping) else value:
+            yield from ("", heading, *_table_lines(path, item))
+
+
+def _is_headed(value: object, prefix: str) -> bool:
+    """Tables get headings down to the second level; deeper ones and tags are written in line."""
+    if isinstance(value, Mapping):
+        return prefix.count(".") < 1
+    return isinstance(value, list | tuple) and bool(value) and isinstance(value[0], Mapping) and prefix in ("", "vehicle")
+
+
+def _key(key: str) -> str:
+    return key if key.replace("_", "").replace("-", "").isalnum() and key.isascii() else json.dumps(key)
+
+
+def _value(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        if value and isinstance(value[0], Mapping):
+            return "[\n" + "".join(f"  {_value(item)},\n" for item in value) + "]"
+        return "[" + ", ".join(_value(item) for item in value) + "]"
+    return repr(float(value)) if isinstance(value, float) else str(value)

@@ -1,0 +1,406 @@
+"""From columns to measurement streams: units, axes, time order, and checks that find wrong declarations.
+
+Reading comes first (`read_…`, times as the file counts them), conversion second (`…_stream`, once t0 and the local
+frame are known). At rest a specific force is about +9.8 m/s^2 along the body's up axis: other magnitudes or
+directions tell of wrong units, wrong axes, or gravity removed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from factorgraph.attitude import ENU_NED, matrix_from_quat, quat_from_matrix
+from factorgraph.errors import InputError
+from factorgraph.geodesy import LocalFrame, ecef_from_geodetic
+from factorgraph.gpstime import GpsTime
+from factorgraph.measurements import HeightStream, ImuStream, PositionStream, RangeStream, ReadReport, Tag, Truth
+from factorgraph.types import Array, BoolArray
+from scenarios.flights import schema
+from scenarios.flights.nmea import NmeaPositions, read_nmea
+from scenarios.flights.rtklib_pos import PosFile, read_pos
+from scenarios.flights.schema import STANDARD_GRAVITY, axes_matrix, nearest_hint
+from scenarios.flights.tables import RawTable, Times, ordered, read_columns, read_times, time_columns
+
+G = 9.8
+DEFAULT_SIGMA_M = (3.0, 3.0, 6.0)  # of position fixes that state none
+MAX_RATE_RPS = 40.0  # no gyroscope of a vehicle measures more (2300 deg/s)
+SAME_S = 1e-3  # two logs of one ranging exchange agree to this
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """What conversion needs to know: t0, the local frame n, and the turn from the recording's axes to n."""
+
+    t0: GpsTime
+    frame: LocalFrame
+    C_nl: Array  # (3, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class Raw:
+    """A file as read: its times, and the table or the solution it holds."""
+
+    times: Times
+    table: RawTable | None = None
+    pos: PosFile | None = None
+    nmea: NmeaPositions | None = None
+
+    def first_ecef(self, frame: str, position: Sequence[str | int]) -> Array | None:
+        """First finite position (3,) ECEF; None when positions are local."""
+        if self.pos is not None:
+            r = self.pos.ecef()
+        elif self.nmea is not None:
+            r = _ecef_of_llh(self.nmea.llh_deg)
+        elif self.table is not None and frame in ("ecef", "llh"):
+            cells = self.table.stack(position)
+            r = cells if frame == "ecef" else _ecef_of_llh(cells)
+        else:
+            return None
+        if r is None:
+            return None
+        finite = r[np.isfinite(r).all(axis=1)]
+        return finite[0] if len(finite) else None
+
+
+def _ecef_of_llh(llh_deg: Array) -> Array:
+    return ecef_from_geodetic(*np.radians(llh_deg[:, :2]).T, llh_deg[:, 2])
+
+
+def read_raw(
+    path: Path,
+    options: schema.TextOptions,
+    kind: str,
+    time: schema.TimeColumn,
+    columns: Sequence[str | int],
+    texts: Sequence[str | int] = (),
+    day: str = "",
+) -> Raw:
+    """Read a file of any kind; columns matter for "csv" and "mat" only. Raises InputError as its readers do."""
+    if kind == "rtklib-pos":
+        pos = read_pos(path)
+        return Raw(pos.times, pos=pos)
+    if kind == "nmea":
+        nmea = read_nmea(path, day)
+        return Raw(nmea.times, nmea=nmea)
+    time_numbers, time_texts = time_columns(time)
+    table = read_columns(path, options, kind, [*time_numbers, *columns], [*time_texts, *texts])
+    return Raw(read_times(table, time), table)
+
+
+def _the_table(raw: Raw) -> RawTable:
+    assert raw.table is not None
+    return raw.table
+
+
+# IMU
+
+
+def read_imu(path: Path, imu: schema.Imu) -> Raw:
+    return read_raw(path, imu, imu.format, imu.time, (*imu.accel, *imu.gyro))
+
+
+def imu_stream(raw: Raw, imu: schema.Imu, place: Place) -> tuple[ImuStream, ReadReport]:
+    """Specific force and rate in the body frame. Raises InputError for wrong units and axes, as far as gravity tells."""
+    table = _the_table(raw)
+    source = str(table.path)
+    f = table.stack(imu.accel) * (STANDARD_GRAVITY if imu.accel_unit == "g" else 1.0)
+    w = table.stack(imu.gyro) * (np.pi / 180 if imu.gyro_unit == "deg/s" else 1.0)
+    t = raw.times.since(place.t0)
+    keep, dropped = ordered(t, np.hstack([f, w]), source)
+    C_bs = imu.C_bs
+    stream = ImuStream(t[keep], f[keep] @ C_bs.T, w[keep] @ C_bs.T, imu.is_mean)
+    notes = _check_gravity(stream, f[keep], w[keep], imu, source)
+    return stream, ReadReport(source, len(stream.t_s), {**table.dropped, **dropped}, notes)
+
+
+def _check_gravity(stream: ImuStream, f_s: Array, w_s: Array, imu: schema.Imu, source: str) -> tuple[str, ...]:
+    """Notes on doubtful units and axes of samples f_s, w_s (n, 3); raises InputError for certain errors."""
+    rest = _quiet(stream)
+    size = float(np.linalg.norm(f_s[rest].mean(axis=0)))
+    rate = float(np.linalg.norm(w_s[rest].mean(axis=0)))
+    notes: list[str] = []
+    if abs(size - G) > 0.25 * G:
+        raise InputError(f"{source}: |f| is {size:.4g} m/s2 where the IMU is quietest, expected about 9.8: {_likely_unit(size, rate, imu)}")
+    if abs(size - G) > 0.04 * G:
+        notes.append(f"|f| is {size:.3f} m/s2 where the IMU is quietest, expected about 9.8: scale, bias, or never at rest")
+    fastest = float(np.percentile(np.linalg.norm(w_s, axis=1), 99.0))
+    if fastest > MAX_RATE_RPS:
+        raise InputError(
+            f'{source}: rates reach {fastest:.0f} rad/s, more than gyroscopes measure; gyro_unit = "deg/s" looks right'
+            if imu.gyro_unit == "rad/s"
+            else f"{source}: rates reach {fastest:.0f} rad/s, more than gyroscopes measure; check gyro columns and unit"
+        )
+    if imu.gyro_unit == "rad/s" and rate > 0.2:
+        notes.append(f'the gyroscopes read {rate:.2f} rad/s where the IMU is quietest; gyro_unit = "deg/s"?')
+    mean = stream.f_b.mean(axis=0)
+    up = float(mean[2] / np.linalg.norm(mean))
+    if up < -0.5:
+        raise InputError(f"{source}: gravity says the vehicle is upside down with axes {imu.axes}{_likely_axes(f_s.mean(axis=0), imu)}")
+    if up < 0.7:
+        notes.append(f"the body's up axis carries {up:.0%} of gravity with axes {imu.axes}{_likely_axes(f_s.mean(axis=0), imu)}")
+    return tuple(notes)
+
+
+def _quiet(stream: ImuStream) -> slice:
+    """The stretch of about a second whose specific force scatters least."""
+    n = len(stream.t_s)
+    span = max(2, min(n, round(1.0 / max(float(np.median(np.diff(stream.t_s))), 1e-4)))) if n > 1 else n
+    blocks = stream.f_b[: n // span * span].reshape(-1, span, 3)
+    start = int(np.argmin(blocks.var(axis=1).sum(axis=1))) * span
+    return slice(start, start + span)
+
+
+def _likely_unit(size: float, rate: float, imu: schema.Imu) -> str:
+    if imu.accel_unit == "m/s2" and abs(size - 1) < 0.1:
+        return 'the values look like g, write accel_unit = "g"'
+    if imu.accel_unit == "g" and abs(size / STANDARD_GRAVITY - G) < 1.0:
+        return 'the values look like m/s2, write accel_unit = "m/s2"'
+    if abs(rate - G) < 1.0 or abs(rate - 1) < 0.1:
+        return "accel and gyro columns look swapped"
+    if abs(size - 1000 * G) < 100 * G or abs(size - 1000) < 100:
+        return "the values look like thousandths (mg or mm/s2)"
+    if size < 0.1 * G:
+        return "gravity looks removed, but specific force is needed as the accelerometers measure it"
+    return "check the accel columns and accel_unit"
+
+
+def _likely_axes(f_s: Array, imu: schema.Imu) -> str:
+    """The usual sets of axes with which a mean specific force (3,) points up."""
+    unit = f_s / np.linalg.norm(f_s)
+    fits = [axes for axes in ("RFU", "FRD", "FLU") if (imu.mounting.C @ axes_matrix(axes) @ unit)[2] > 0.8]
+    if fits:
+        return f"; {' or '.join(fits)} would have it upright"
+    return f"; the columns see up along ({unit[0]:+.2f}, {unit[1]:+.2f}, {unit[2]:+.2f}), so check axes and mounting"
+
+
+# positions, heights, truth
+
+
+def read_positions(path: Path, p: schema.Positions) -> Raw:
+    return read_raw(path, p, p.format, p.time, (*p.position, *(p.sigma or ())), day=p.date)
+
+
+def position_stream(raw: Raw, p: schema.Positions, lever_b: schema.Vec3, place: Place, path: Path) -> tuple[PositionStream, ReadReport]:
+    """Position fixes in n with their standard deviations per axis of n."""
+    r_n, dropped, n_rows = _positions_n(raw, p.frame, p.position, place)
+    sigma = _position_sigma(raw, p, place, len(r_n))
+    t = raw.times.since(place.t0)
+    keep, more = ordered(t, np.hstack([r_n, sigma]), str(path))
+    stream = PositionStream(t[keep], r_n[keep], np.maximum(sigma[keep], 1e-4), lever_b, p.name)
+    return stream, ReadReport(str(path), len(stream.t_s), {**dropped, **more})
+
+
+def _positions_n(raw: Raw, frame: str, columns: Sequence[str | int], place: Place) -> tuple[Array, dict[str, int], int]:
+    """Positions (n, 3) in the local frame, what reading dropped, and the rows of the file."""
+    if raw.pos is not None:
+        r_ecef = raw.pos.ecef()
+        r_n = raw.pos.position if r_ecef is None else place.frame.from_ecef(r_ecef)
+        return r_n, raw.pos.dropped, raw.pos.n_rows
+    if raw.nmea is not None:
+        return place.frame.from_ecef(_ecef_of_llh(raw.nmea.llh_deg)), raw.nmea.dropped, raw.nmea.n_rows
+    table = _the_table(raw)
+    cells = table.stack(columns)
+    if cells.shape[1] == 2:
+        cells = np.column_stack([cells, np.zeros(len(cells))])
+    if frame == "llh":
+        r_n = place.frame.from_ecef(_ecef_of_llh(cells))
+    elif frame == "ecef":
+        r_n = place.frame.from_ecef(cells)
+    else:
+        r_n = cells @ _turn(frame, place).T
+    return r_n, table.dropped, table.n_rows
+
+
+def _turn(frame: str, place: Place) -> Array:
+    """Rotation (3, 3) from the axes of a local or north-east-down file to n."""
+    return place.C_nl @ ENU_NED if frame == "ned" else place.C_nl
+
+
+def _position_sigma(raw: Raw, p: schema.Positions, place: Place, n: int) -> Array:
+    if p.sigma is not None and raw.table is not None:
+        return raw.table.stack(p.sigma)
+    if p.sigma_m is None and raw.pos is not None:
+        sigma = np.sqrt(np.diagonal(raw.pos.cov_enu(place.frame.C_en), axis1=1, axis2=2))
+        return np.where(sigma > 0, sigma, DEFAULT_SIGMA_M)
+    if p.sigma_m is None and raw.nmea is not None:
+        return raw.nmea.sigma_enu_m
+    return np.tile(np.array(p.sigma_m or DEFAULT_SIGMA_M), (n, 1))
+
+
+def read_heights(path: Path, h: schema.Heights) -> Raw:
+    return read_raw(path, h, h.format, h.time, (h.height,))
+
+
+def height_stream(raw: Raw, h: schema.Heights, lever_b: schema.Vec3, place: Place) -> tuple[HeightStream, ReadReport]:
+    """Heights above the local origin; cells outside [valid_min, valid_max] are counted."""
+    table = _the_table(raw)
+    cells = table.numbers[h.height]
+    up = h.scale * cells + h.offset_m - (place.frame.h_m if h.ellipsoidal else 0.0)
+    t = raw.times.since(place.t0)
+    keep, dropped = ordered(t, up[:, None], str(table.path))
+    outside = keep & ~((cells >= h.valid_min) & (cells <= h.valid_max))
+    keep &= ~outside
+    thin = _thinned(t, keep, h.min_interval_s)
+    counts = {"outside valid_min and valid_max": int(outside.sum()), "thinned by min_interval_s": int(keep.sum() - thin.sum())}
+    if not thin.any():
+        raise InputError(f"{table.path}: no height lies between valid_min {h.valid_min:g} and valid_max {h.valid_max:g}")
+    stream = HeightStream(t[thin], up[thin], np.full(int(thin.sum()), h.sigma_m), lever_b, h.name)
+    dropped |= {reason: n for reason, n in counts.items() if n}
+    return stream, ReadReport(str(table.path), len(stream.t_s), {**table.dropped, **dropped})
+
+
+def _thinned(t: Array, keep: BoolArray, interval_s: float) -> BoolArray:
+    """The first kept row of every interval."""
+    if interval_s <= 0:
+        return keep
+    thin = np.zeros(len(t), bool)
+    rows = np.flatnonzero(keep)
+    cell = np.floor((t[rows] - t[rows[0]]) / interval_s + 1e-6) if rows.size else np.zeros(0)
+    thin[rows[np.unique(cell, return_index=True)[1]]] = True
+    return thin
+
+
+def constant_heights(h: schema.Heights, lever_b: schema.Vec3, start_s: float, end_s: float) -> HeightStream:
+    """The constant height at regular times over a span."""
+    t = np.arange(start_s, end_s + 1e-6, h.interval_s)
+    up = np.full(len(t), h.scale * (h.constant_m or 0.0) + h.offset_m)
+    return HeightStream(t, up, np.full(len(t), h.sigma_m), lever_b, h.name)
+
+
+def read_truth(path: Path, truth: schema.TruthTable) -> Raw:
+    columns = (*truth.position, *(truth.velocity or ()), *(truth.quaternion or ()))
+    return read_raw(path, truth, truth.format, truth.time, columns, day=truth.date)
+
+
+def truth_of(raw: Raw, truth: schema.TruthTable, C_ba: Array, lever_b: Array, place: Place, path: Path) -> tuple[Truth, ReadReport]:
+    """Reference trajectory of the IMU.
+
+    C_ba (3, 3): from the vehicle's declared axes to the body; lever_b (3,): from the declared origin to the IMU.
+    """
+    r_n, dropped, n_rows = _positions_n(raw, truth.frame, truth.position, place)
+    t = raw.times.since(place.t0)
+    C_nb, v_n = _truth_attitude(raw, truth, C_ba, place), _truth_velocity(raw, truth, place)
+    keep, more = ordered(t, np.hstack([r_n, *(x.reshape(len(t), -1) for x in (C_nb, v_n) if x is not None)]), str(path))
+    notes: tuple[str, ...] = ()
+    if np.any(lever_b):
+        if C_nb is None:
+            notes = ("truth has no attitude, so it is not moved from its origin to the IMU",)
+        else:
+            r_n = r_n + C_nb @ lever_b
+        if v_n is not None:
+            v_n, notes = None, (*notes, "the true velocity is left out: it belongs to another point than the IMU")
+    q_nb = None if C_nb is None else quat_from_matrix(C_nb[keep])
+    result = Truth(t[keep], r_n[keep], None if v_n is None else v_n[keep], q_nb)
+    return result, ReadReport(str(path), len(result.t_s), {**dropped, **more}, notes)
+
+
+def _truth_attitude(raw: Raw, truth: schema.TruthTable, C_ba: Array, place: Place) -> Array | None:
+    if truth.quaternion is None or raw.table is None:
+        return None
+    q = raw.table.stack(truth.quaternion)
+    if truth.quaternion_order == "xyzw":
+        q = q[:, [3, 0, 1, 2]]
+    norm = np.linalg.norm(q, axis=1, keepdims=True)
+    wrong = int(np.sum(np.abs(norm - 1) > 0.01))
+    if wrong > 0.5 * len(q):
+        raise InputError(f"{raw.table.path}: {wrong} of {len(q)} quaternions are not of unit length; check the columns of truth.quaternion")
+    C = matrix_from_quat(np.where(np.abs(norm - 1) > 0.01, np.nan, q / np.where(norm > 0, norm, 1.0)))
+    return np.asarray(_turn(truth.frame, place) @ C @ C_ba.T)
+
+
+def _truth_velocity(raw: Raw, truth: schema.TruthTable, place: Place) -> Array | None:
+    if truth.velocity is None or raw.table is None:
+        return None
+    v = raw.table.stack(truth.velocity)
+    if truth.frame == "ecef":
+        return place.frame.rotate_from_ecef(v)
+    return np.asarray(v @ _turn(truth.frame, place).T)
+
+
+# ranges
+
+
+@dataclass(slots=True)
+class _RangeRows:
+    """Rows of the files of a range set, one after another."""
+
+    t: list[Array] = field(default_factory=list)
+    r: list[Array] = field(default_factory=list)
+    sigma: list[Array] = field(default_factory=list)
+    a: list[Array] = field(default_factory=list)
+    b: list[Array] = field(default_factory=list)
+
+
+def read_ranges(path: Path, ranges: schema.Ranges) -> Raw:
+    numbers = (ranges.range, *(() if ranges.sigma is None else (ranges.sigma,)))
+    return read_raw(path, ranges, ranges.format, ranges.time, numbers, (ranges.tag_a, ranges.tag_b))
+
+
+def range_stream(raws: Sequence[Raw], ranges: schema.Ranges, tags: tuple[Tag, ...], place: Place) -> tuple[RangeStream, ReadReport]:
+    """Ranges of all files in time order; exchanges that two files log are kept once.
+
+    Rows with tags that are not declared are counted. Raises InputError when no row is left.
+    """
+    index = {tag.name: i for i, tag in enumerate(tags)}
+    unknown: set[str] = set()
+    rows = _RangeRows()
+    for raw in raws:
+        table = _the_table(raw)
+        rows.t.append(raw.times.since(place.t0))
+        rows.r.append(ranges.scale * table.numbers[ranges.range] + ranges.offset_m)
+        rows.sigma.append(np.full(table.n_rows_kept, ranges.sigma_m) if ranges.sigma is None else table.numbers[ranges.sigma])
+        rows.a.append(_tag_index(table.texts[ranges.tag_a], index, unknown))
+        rows.b.append(_tag_index(table.texts[ranges.tag_b], index, unknown))
+    t, r, sigma, a, b = (np.concatenate(column) for column in (rows.t, rows.r, rows.sigma, rows.a, rows.b))
+    source = ", ".join(str(_the_table(raw).path) for raw in raws)
+    finite = np.isfinite(t) & np.isfinite(r) & np.isfinite(sigma) & (sigma > 0)
+    declared = (a >= 0) & (b >= 0) & (a != b)
+    usable = finite & declared & (r > 0)
+    if not usable.any():
+        hint = f"; the file names tags {', '.join(sorted(unknown)[:10])}{nearest_hint(min(unknown), sorted(index))}" if unknown else ""
+        raise InputError(f"{source}: no range between declared tags ({', '.join(index)}){hint}")
+    order = np.flatnonzero(usable)[np.argsort(t[usable], kind="stable")]
+    again = _logged_twice(t[order], r[order], np.sort(np.column_stack([a[order], b[order]]), axis=1))
+    kept = order[~again]
+    counts = {
+        "with empty or non-numeric cells": int(np.sum(~finite)),
+        "between tags that are not declared": int(np.sum(finite & ~declared)),
+        "not positive": int(np.sum(finite & declared & ~(r > 0))),
+        "logged twice": int(again.sum()),
+    }
+    dropped = {reason: n for raw in raws for reason, n in _the_table(raw).dropped.items()}
+    dropped |= {reason: n for reason, n in counts.items() if n}
+    stream = RangeStream(t[kept], a[kept], b[kept], tags, r[kept], sigma[kept], ranges.name)
+    return stream, ReadReport(source, len(kept), dropped)
+
+
+def _tag_index(names: np.ndarray[tuple[int], np.dtype[np.str_]], index: dict[str, int], unknown: set[str]) -> Array:
+    """Row -> declared tag, -1 for others; a numeric name such as 2.0e+00 is the tag 2."""
+    distinct, inverse = np.unique(names, return_inverse=True)
+    numbers = [index.get(name, index.get(_plain(name), -1)) for name in distinct.tolist()]
+    unknown.update(_plain(name) for name, number in zip(distinct.tolist(), numbers, strict=True) if number < 0)
+    return np.array(numbers, np.int64)[inverse]
+
+
+def _plain(name: str) -> str:
+    try:
+        value = float(name)
+    except ValueError:
+        return name
+    return str(int(value)) if value.is_integer() else name
+
+
+def _logged_twice(t: Array, r: Array, pair: Array) -> BoolArray:
+    """Rows (in time order) that repeat the range of the same pair of tags within SAME_S."""
+    order = np.lexsort((t, r, pair[:, 1], pair[:, 0]))
+    same = np.zeros(len(t), bool)
+    same[1:] = (
+        (np.diff(pair[order], axis=0) == 0).all(axis=1) & (np.diff(r[order]) == 0) & (np.abs(np.diff(t[order])) <= SAME_S)
+    )
+    again = np.zeros(len(t), bool)
+    again[order] = same
+    return again

@@ -1,0 +1,148 @@
+"""Long commands run in a watched child process, so that a crash of native code is told and Ctrl-C always works.
+
+The child is the same command with `--run-trace FILE`. It writes a line `stage: …` to that file whenever it begins
+something new, and Python's fault handler appends its trace there when a native library dies. The parent forwards
+Ctrl-C (and SIGTERM and SIGHUP, which mean the same here), waits, and turns a death by signal into one line.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+
+DONE, DEGRADED, FAILED, BUG, INTERRUPTED = 0, 1, 2, 3, 130
+TRACE_OPTION = "--run-trace"
+CRASH_FILE = "crash.txt"
+RESEND_S = 0.5  # the child may not have installed its handler yet; it acts on the first signal only
+
+_ROOT = Path(__file__).resolve().parent.parent
+
+
+class Stopped(Exception):
+    """An early end of a command: its exit code and the line that tells why."""
+
+    def __init__(self, code: int, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class Trace:
+    """The child's side: tells the parent what is going on, and arms the fault handler and the signals."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w", encoding="utf-8")
+        faulthandler.enable(self._file)
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), _interrupt_once)
+
+    def stage(self, name: str) -> None:
+        """Note what begins now."""
+        self._file.write(f"stage: {name}\n")
+        self._file.flush()
+
+
+def _interrupt_once(signum: int, frame: FrameType | None) -> NoReturn:
+    # one interrupt: what follows is saving and cleaning up, which must not be interrupted again
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    raise KeyboardInterrupt
+
+
+def run(argv: Sequence[str], out: Path, quiet: bool = False) -> int:
+    """Run `relnav argv` in a child and return its exit code; a crash is printed as one line and is FAILED.
+
+    `out` is the folder of results: the trace of a crash is kept there. `quiet` drops what it prints on stdout.
+    """
+    with tempfile.TemporaryDirectory(prefix="relnav-") as folder:
+        trace = Path(folder) / "trace.txt"
+        child = _start([*argv, TRACE_OPTION, str(trace)], quiet)
+        code, was_killed = _wait(child)
+        if was_killed or code == -signal.SIGINT:
+            print(f"relnav: stopped at once; what was finished is in {out}", file=sys.stderr)
+            return INTERRUPTED
+        if code not in (DONE, DEGRADED, FAILED, BUG, INTERRUPTED):
+            print(f"relnav: error: {_describe(code, trace)}{_keep(trace, out)}", file=sys.stderr)
+            return FAILED
+        return code
+
+
+def _start(argv: list[str], quiet: bool) -> subprocess.Popen[bytes]:
+    path = os.pathsep.join(p for p in (str(_ROOT), os.environ.get("PYTHONPATH", "")) if p)
+    env = {**os.environ, "PYTHONPATH": path}
+    # -P: a folder or file in the working directory must not hide a module
+    command = [sys.executable, "-P", "-m", "scenarios", *argv]
+    # an ignored signal stays ignored in the child until Trace takes it: no half-started interpreter is interrupted
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        return subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL if quiet else None)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _wait(child: subprocess.Popen[bytes]) -> tuple[int, bool]:
+    """The child's exit code, and whether a second Ctrl-C killed it."""
+    restore = {}
+    for name in ("SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            restore[name] = signal.signal(getattr(signal, name), signal.default_int_handler)
+    interrupts = 0
+    try:
+        while True:
+            try:
+                return child.wait(RESEND_S if interrupts else None), interrupts > 1
+            except KeyboardInterrupt:
+                interrupts += 1
+                _interrupt(child, interrupts > 1)
+            except subprocess.TimeoutExpired:
+                _interrupt(child, False)
+    finally:
+        for name, handler in restore.items():
+            signal.signal(getattr(signal, name), handler)
+
+
+def _interrupt(child: subprocess.Popen[bytes], at_once: bool) -> None:
+    if at_once:
+        child.kill()
+    elif os.name == "posix":  # elsewhere the console tells the child itself
+        child.send_signal(signal.SIGINT)
+
+
+def _describe(code: int, trace: Path) -> str:
+    if -code in {s.value for s in signal.Signals}:
+        how = f"signal {-code}, {signal.Signals(-code).name}"
+    else:
+        how = f"status {code & 0xFFFFFFFF:#x}"
+    if os.name == "posix" and code == -signal.SIGKILL:
+        what = f"the run was killed ({how}), often because memory ran out,"
+    else:
+        what = f"a native library crashed ({how})"
+    text = trace.read_text(encoding="utf-8", errors="replace") if trace.exists() else ""
+    stages = re.findall(r"^stage: (.*)$", text, re.MULTILINE)
+    files = ((Path(file), line) for file, line in re.findall(r'File "([^"]+)", line (\d+)', text))
+    where = next((f" at {file.relative_to(_ROOT)}:{line}" for file, line in files if _is_ours(file)), "")
+    return f"{what} in the stage {stages[-1] if stages else 'start'!r}{where}"
+
+
+def _is_ours(file: Path) -> bool:
+    return file.is_relative_to(_ROOT) and file.relative_to(_ROOT).parts[0] in ("ambiguity", "factorgraph", "scenarios", "swarm")
+
+
+def _keep(trace: Path, out: Path) -> str:
+    """Copies the trace of a crash to the results; what to add to the message."""
+    if not trace.exists():
+        return ""
+    out.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(trace, out / CRASH_FILE)
+    return f"; trace in {out / CRASH_FILE}"

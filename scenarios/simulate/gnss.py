@@ -1,0 +1,343 @@
+"""GNSS observations of real constellations: code, phase and Doppler as a receiver on the vehicle would give them.
+
+A receiver whose clock is off by dt_u tags an epoch t_r and measures at the true instant t = t_r - dt_u. With the travel
+time tau, rho is the range from the antenna at t to the satellite at t - tau, turned by the Earth's rotation during tau:
+
+    P    = rho + c dt_u - c dt_s + T + I + noise + multipath + outlier
+    Phi  = rho + c dt_u - c dt_s + T - I + noise + lambda N          (in cycles: Phi / lambda)
+    -lambda D = d rho / dt (1 - ddt_u) + c ddt_u - c ddt_s + noise
+
+T and I are the models that estimators use, times the factors of the environment; errors of broadcast orbits and clocks
+are common to all receivers. Standard deviations grow with 1 / sin(el) as `factorgraph.problem.GnssNoise` says. N is an
+integer, new whenever tracking starts again, and jumps at a cycle slip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import Field, PositiveFloat, PositiveInt
+from scipy.signal import lfilter
+
+from factorgraph import geodesy
+from factorgraph.errors import InputError
+from factorgraph.geodesy import C_MPS, OMEGA_E_RPS, LocalFrame
+from factorgraph.gpstime import GpsTime
+from factorgraph.measurements import GnssStream
+from factorgraph.models import atmosphere
+from factorgraph.models.gnss import elevation_scale, look_angles
+from factorgraph.problem import Antenna, GnssNoise, Vec3
+from factorgraph.types import Array, BoolArray, IntArray
+from scenarios.flights.navigation import Navigation
+from scenarios.flights.schema import GnssNoiseTable, Table
+from scenarios.flights.signals import MEGAHERTZ, wavelength_m
+from scenarios.simulate.fixes import epochs
+from scenarios.simulate.streams import Streams
+from scenarios.simulate.trajectory import Trajectory
+
+SEARCH_S = 60.0  # spacing at which satellites above the horizon are looked for
+SEARCH_MARGIN_RAD = np.deg2rad(2.0)  # more than a satellite moves meanwhile
+INTEGER_RANGE = 1000
+ERROR_NODE_S = 30.0
+WAVELENGTH_L1_M = wavelength_m("G1C")
+
+Probability = Field(default=0.0, ge=0, le=1)
+
+
+class Outage(Table):
+    """No tracking from `start_s` to `end_s`, of some satellites or of all."""
+
+    start_s: float
+    end_s: float
+    satellites: tuple[str, ...] = ()
+
+
+class ClockTable(Table):
+    """Receiver clock: offset and drift at the start, and how the drift walks."""
+
+    offset_s: float = Field(default=3e-4, ge=0, le=0.01)  # drawn evenly between plus and minus this
+    drift: float = Field(default=1e-7, ge=0)  # standard deviation, seconds per second
+    drift_walk_rts: float = Field(default=1e-9, ge=0)  # density, per sqrt(s)
+
+
+class GnssTable(Table):
+    """A receiver and its antenna."""
+
+    rate_hz: PositiveFloat = 1.0
+    offset_s: float = Field(default=0.0, ge=0)
+    lever_b: Vec3 = (0.0, 0.0, 0.0)
+    signals: tuple[str, ...] = ("G1C", "E1C")
+    noise: GnssNoiseTable = GnssNoiseTable()  # simulated, and what the estimator is told
+    mask_deg: float = Field(default=5.0, ge=3, lt=90)
+    clock: ClockTable = ClockTable()
+    multipath_m: float = Field(default=0.0, ge=0)  # zenith standard deviation, grows as the code's does
+    multipath_s: PositiveFloat = 40.0
+    outlier_probability: float = Probability  # of a code
+    outlier_m: tuple[PositiveFloat, PositiveFloat] = (5.0, 50.0)  # smallest and largest size, either sign
+    slips_per_hour: float = Field(default=0.0, ge=0)  # of every satellite
+    slip_cycles: PositiveInt = 20  # largest
+    lli_probability: float = Field(default=1.0, ge=0, le=1)  # that the receiver flags a slip
+    outages: tuple[Outage, ...] = ()
+
+
+class EnvironmentTable(Table):
+    """What all receivers share."""
+
+    troposphere: float = Field(default=1.0, ge=0)  # times the model's delay
+    ionosphere: float = Field(default=1.0, ge=0)  # times the broadcast model's delay; 0: none is broadcast either
+    satellite_error_m: float = Field(default=0.0, ge=0)  # broadcast orbits and clocks, standard deviation of a range
+    satellite_error_s: PositiveFloat = 1800.0
+
+
+@dataclass(frozen=True, slots=True)
+class Slip:
+    """A jump of the integer of one satellite and signal."""
+
+    t_s: float
+    satellite: str
+    signal: str
+    cycles: int
+    flagged: bool
+
+
+@dataclass(frozen=True, slots=True)
+class GnssRecord:
+    """What was put in, row by row of the stream."""
+
+    integer: IntArray  # (n,) N
+    outlier_m: Array  # (n,) 0 where there is none
+    range_m: Array  # (n,) rho
+    elevation_rad: Array  # (n,)
+    slips: tuple[Slip, ...]
+    clock_s: Array  # (m,) receiver clock offset per epoch
+    clock_drift: Array  # (m,)
+
+
+@dataclass(frozen=True, slots=True)
+class Sky:
+    """Constellation, place, time and atmosphere."""
+
+    navigation: Navigation
+    frame: LocalFrame
+    t0: GpsTime
+    duration_s: float
+    environment: EnvironmentTable
+    streams: Streams
+
+    def satellite_error_m(self, satellites: tuple[str, ...], sat: IntArray, t_s: Array) -> Array:
+        """Range error (n,) of broadcast orbits and clocks: Gauss-Markov between nodes, the same for every receiver."""
+        nodes = np.arange(-ERROR_NODE_S, self.duration_s + 2 * ERROR_NODE_S, ERROR_NODE_S)
+        error = np.zeros(len(sat))
+        for k, name in enumerate(satellites):
+            rows = sat == k
+            unit = _correlated(self.streams(name).normal(0.0, 1.0, len(nodes)), ERROR_NODE_S / self.environment.satellite_error_s)
+            error[rows] = np.interp(t_s[rows], nodes, unit)
+        return error * self.environment.satellite_error_m
+
+
+@dataclass(frozen=True, slots=True)
+class _Geometry:
+    """Epochs by satellites; satellite states at transmission."""
+
+    pos: Array  # (m, S, 3)
+    vel: Array
+    clock_m: Array  # (m, S)
+    clock_mps: Array
+    record: IntArray
+    rho: Array
+    rho_dot: Array
+    az: Array
+    el: Array
+    tropo: Array
+    iono_l1: Array
+
+
+def check_signals(signals: tuple[str, ...]) -> None:
+    """Raises InputError for a signal that is not system, band and attribute of a known carrier."""
+    for name in signals:
+        if len(name) != 3 or name[1] not in MEGAHERTZ.get(name[0], {}):
+            raise InputError(f'signal "{name}": write system, band and attribute of a carrier, such as "G1C", "E5Q" or "C2I"')
+
+
+def simulate(table: GnssTable, sky: Sky, trajectory: Trajectory, streams: Streams, noise_scale: float) -> tuple[Antenna, GnssRecord]:
+    """Observations of the whole flight.
+
+    `noise_scale` multiplies noise, multipath, outliers and satellite errors; clocks, integers and slips stay. Raises
+    InputError for unknown signals or when no satellite is ever in view.
+    """
+    check_signals(table.signals)
+    noise = table.noise.noise
+    t_tag = epochs(table.rate_hz, table.offset_s, sky.duration_s)
+    clock_s, drift = _clock(table.clock, t_tag, streams("clock"))
+    t = t_tag - clock_s
+    r_n, v_n = trajectory.at(t).point(table.lever_b)
+    r, v = sky.frame.to_ecef(r_n), sky.frame.rotate_to_ecef(v_n)
+    names = _in_view(table, sky, t, r)
+    geometry = _geometry(sky, names, t, r, v)
+    tracked = (geometry.el >= np.deg2rad(table.mask_deg)) & (geometry.record >= 0) & ~_outages(table.outages, names, t)
+    belongs = np.array([[signal[0] == name[0] for signal in table.signals] for name in names])
+    e, s, k = np.nonzero(tracked[:, :, None] & belongs)
+    if not len(e):
+        raise InputError(f"no satellite with {', '.join(table.signals)} is above {table.mask_deg:g} deg: check signals, mask and outages")
+
+    def drawn(source: str, draw: Callable[[np.random.Generator, int], Array]) -> Array:
+        """Per row, from a stream of each satellite and signal that covers every epoch."""
+        out = np.zeros((len(t), *belongs.shape))
+        for i, j in np.argwhere(belongs):
+            out[:, i, j] = draw(streams(f"{source}/{names[i]}/{table.signals[j]}"), len(t))
+        return out[e, s, k]
+
+    def normal(rng: np.random.Generator, n: int) -> Array:
+        return rng.normal(0.0, 1.0, n)
+
+    lam = np.array([[wavelength_m(j, sky.navigation.glonass_channels.get(i)) for j in table.signals] for i in names])[s, k]
+    el = geometry.el[e, s]
+    scale = noise_scale * elevation_scale(el)
+    integer, lli, slips = _integers(table, names, tracked, t_tag, streams)
+    outlier = noise_scale * drawn("outlier", lambda rng, n: _outliers(table, rng, n))
+    multipath = scale * table.multipath_m * drawn("multipath", lambda rng, n: _correlated(normal(rng, n), 1 / table.rate_hz / table.multipath_s))
+    sat_clock = geometry.clock_m[e, s] - sky.navigation.group_delay_m(geometry.record[e, s], table.signals, k)
+    common = geometry.rho[e, s] + C_MPS * clock_s[e] - sat_clock + geometry.tropo[e, s]
+    common += noise_scale * sky.satellite_error_m(names, s, t[e])
+    iono = geometry.iono_l1[e, s] * (lam / WAVELENGTH_L1_M) ** 2
+    rate = geometry.rho_dot[e, s] * (1 - drift[e]) + C_MPS * drift[e] - geometry.clock_mps[e, s]
+    code = common + iono + scale * noise.code_m * drawn("code", normal) + multipath + outlier
+    phase = common - iono + scale * noise.phase_m * drawn("phase", normal)
+    rate = rate + scale * noise.doppler_mps * drawn("doppler", normal)
+    used, sat = np.unique(s, return_inverse=True)
+    used_signals, signal = np.unique(k, return_inverse=True)
+    stream = GnssStream(
+        t_s=t_tag,
+        epoch=e,
+        sat=sat,
+        signal=signal,
+        satellites=tuple(names[i] for i in used),
+        signals=tuple(table.signals[j] for j in used_signals),
+        wavelength_m=lam,
+        code_m=code,
+        phase_cyc=phase / lam + integer[e, s, k],
+        doppler_hz=-rate / lam,
+        cn0_dbhz=34.0 + 16.0 * np.sin(el) + noise_scale * 0.7 * drawn("cn0", normal),
+        lli=lli[e, s],
+        sat_pos_ecef=geometry.pos[e, s],
+        sat_vel_ecef=geometry.vel[e, s],
+        sat_clock_m=sat_clock,
+        sat_clock_mps=geometry.clock_mps[e, s],
+        approx_ecef=np.round(r[0], 4),
+        klobuchar=sky.navigation.klobuchar,
+    )
+    record = GnssRecord(integer[e, s, k], outlier, geometry.rho[e, s], el, slips, clock_s, drift)
+    return Antenna(stream, table.lever_b, told(table)), record
+
+
+def told(table: GnssTable) -> GnssNoise:
+    """Noise as the estimator is told: multipath counts as code noise."""
+    noise = table.noise.noise
+    return replace(noise, code_m=float(np.hypot(noise.code_m, table.multipath_m)))
+
+
+def _clock(table: ClockTable, t_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    start, rate, steps = rng.uniform(-1, 1), rng.normal(), rng.normal(0.0, 1.0, len(t_s))
+    dt = np.diff(t_s, prepend=t_s[0])
+    drift = table.drift * rate + np.cumsum(table.drift_walk_rts * np.sqrt(dt) * steps)
+    mean = 0.5 * (drift + np.concatenate([drift[:1], drift[:-1]]))
+    return table.offset_s * start + np.cumsum(mean * dt), drift
+
+
+def _correlated(unit: Array, step: float) -> Array:
+    """Gauss-Markov sequence (n,) of unit variance from white noise; `step` in correlation times."""
+    a = np.exp(-step)
+    drive = np.sqrt(1 - a * a) * unit
+    drive[0] = unit[0]
+    return np.asarray(lfilter([1.0], [1.0, -a], drive))
+
+
+def _outliers(table: GnssTable, rng: np.random.Generator, n: int) -> Array:
+    hit, sign = rng.random(n) < table.outlier_probability, rng.choice([-1.0, 1.0], n)
+    return np.where(hit, sign * rng.uniform(*table.outlier_m, n), 0.0)
+
+
+def _outages(outages: tuple[Outage, ...], names: tuple[str, ...], t_s: Array) -> BoolArray:
+    """(m, S) True where tracking is interrupted."""
+    lost = np.zeros((len(t_s), len(names)), bool)
+    for outage in outages:
+        during = (t_s >= outage.start_s) & (t_s < outage.end_s)
+        which = np.array([not outage.satellites or name in outage.satellites for name in names])
+        lost |= during[:, None] & which
+    return lost
+
+
+def _in_view(table: GnssTable, sky: Sky, t_s: Array, r_ecef: Array) -> tuple[str, ...]:
+    """Satellites with a wanted signal that come above the mask."""
+    systems = {signal[0] for signal in table.signals}
+    names = tuple(name for name in sky.navigation.satellites if name[0] in systems)
+    at = np.unique(np.append(np.arange(0, len(t_s), max(1, int(SEARCH_S * table.rate_hz))), len(t_s) - 1))
+    i, sat = np.repeat(at, len(names)), np.tile(np.arange(len(names)), len(at))
+    pos = sky.navigation.states_at(names, sat, sky.t0, t_s[i]).pos_ecef
+    _, el = _angles(pos, r_ecef[i])
+    seen = np.any((el > np.deg2rad(table.mask_deg) - SEARCH_MARGIN_RAD).reshape(len(at), len(names)), axis=0)
+    return tuple(name for name, ok in zip(names, seen, strict=True) if ok)
+
+
+def _angles(sat_ecef: Array, r_ecef: Array) -> tuple[Array, Array]:
+    """Azimuth and elevation (n,); NaN for satellites without a state."""
+    los = sat_ecef - r_ecef
+    los /= np.linalg.norm(los, axis=1, keepdims=True)
+    lat, lon, _ = geodesy.geodetic_from_ecef(r_ecef)
+    return look_angles(np.einsum("nij,nj->ni", geodesy.C_en(lat, lon), los))
+
+
+def _geometry(sky: Sky, names: tuple[str, ...], t_s: Array, r: Array, v: Array) -> _Geometry:
+    m, S = len(t_s), len(names)
+    epoch, sat = np.repeat(np.arange(m), S), np.tile(np.arange(S), m)
+    states, travel = sky.navigation.states_seen_from(names, sat, sky.t0, t_s[epoch], r[epoch])
+    turned, turning = _turned(states.pos_ecef, travel)
+    e = turned - r[epoch]
+    e /= np.linalg.norm(e, axis=1, keepdims=True)
+    sat_vel, _ = _turned(states.vel_ecef, travel)
+    # rho_dot = e.(v_s (1 - tau_dot) + turning tau_dot - v), tau_dot = rho_dot / c
+    closing = np.einsum("ni,ni->n", e, sat_vel - v[epoch])
+    rho_dot = closing / (1 + np.einsum("ni,ni->n", e, sat_vel - turning) / C_MPS)
+    lat, lon, h = (x[epoch] for x in geodesy.geodetic_from_ecef(r))
+    az, el = look_angles(np.einsum("nij,nj->ni", geodesy.C_en(lat, lon), e))
+    tropo = sky.environment.troposphere * atmosphere.troposphere_m(lat, h, el)
+    iono = np.zeros(m * S)
+    if sky.navigation.klobuchar is not None:
+        iono = sky.environment.ionosphere * atmosphere.klobuchar_m(sky.navigation.klobuchar, sky.t0.sow + t_s[epoch], lat, lon, az, el)
+    columns = (states.clock_m, states.clock_mps, states.record, C_MPS * travel, rho_dot, az, el, tropo, iono)
+    return _Geometry(states.pos_ecef.reshape(m, S, 3), states.vel_ecef.reshape(m, S, 3), *(x.reshape(m, S) for x in columns))
+
+
+def _turned(x: Array, travel_s: Array) -> tuple[Array, Array]:
+    """Vectors (n, 3) of the transmission's ECEF frame in that of reception, and the derivative to the travel time."""
+    c, s = np.cos(OMEGA_E_RPS * travel_s), np.sin(OMEGA_E_RPS * travel_s)
+    out = np.column_stack([c * x[:, 0] + s * x[:, 1], c * x[:, 1] - s * x[:, 0], x[:, 2]])
+    return out, OMEGA_E_RPS * np.column_stack([out[:, 1], -out[:, 0], np.zeros(len(x))])
+
+
+def _integers(
+    table: GnssTable, names: tuple[str, ...], tracked: BoolArray, t_tag: Array, streams: Streams
+) -> tuple[IntArray, IntArray, tuple[Slip, ...]]:
+    """Integers (m, S, K), loss-of-lock flags (m, S) and the list of slips."""
+    m = len(tracked)
+    begins = tracked & ~np.vstack([np.zeros((1, len(names)), bool), tracked[:-1]])
+    arc = np.cumsum(begins, axis=0) - 1
+    lli = (begins & (np.arange(m) > 0)[:, None]).astype(np.int64)
+    integer = np.zeros((*tracked.shape, len(table.signals)), np.int64)
+    slips = []
+    for i, name in enumerate(names):
+        own = streams / f"integers/{name}"
+        slipped = (own("slips").random(m) < table.slips_per_hour / 3600 / table.rate_hz) & tracked[:, i] & ~begins[:, i]
+        flagged = own("flags").random(m) < table.lli_probability
+        lli[slipped & flagged, i] = 1
+        for j, signal in enumerate(table.signals):
+            if signal[0] != name[0]:
+                continue
+            rng = own(signal)
+            start = rng.integers(-INTEGER_RANGE, INTEGER_RANGE + 1, m)
+            jump = rng.integers(1, table.slip_cycles + 1, m) * rng.choice([-1, 1], m)
+            integer[:, i, j] = start[np.maximum(arc[:, i], 0)] + np.cumsum(np.where(slipped, jump, 0))
+            slips += [Slip(float(t_tag[n]), name, signal, int(jump[n]), bool(flagged[n])) for n in np.flatnonzero(slipped)]
+    return integer, lli, tuple(sorted(slips, key=lambda slip: (slip.t_s, slip.satellite, slip.signal)))

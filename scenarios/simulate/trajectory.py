@@ -1,0 +1,289 @@
+"""Smooth trajectories: waypoints, manoeuvres, formation flight, standstill.
+
+Whatever describes a motion is sampled every `NODE_S` and becomes two quintic splines, one of the position in n and one
+of pitch, roll and heading. Both are four times continuously differentiable, so specific force and rates are smooth, and
+the trajectory can be evaluated at any time, which measurements with odd time stamps need.
+
+Attitude follows the motion. Heading is along the track and pitch is the climb angle; `coordinated` banks so that no
+specific force acts sideways, tan(roll) = a_right / (g + a_up); `level` keeps the wings level, like a car.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, PositiveFloat
+from scipy.interpolate import BSpline, make_interp_spline
+
+from factorgraph.attitude import matrix_from_euler, quat_from_matrix
+from factorgraph.errors import InputError
+from factorgraph.measurements import Truth
+from factorgraph.problem import Vec3
+from factorgraph.types import Array
+from scenarios.flights.schema import Table
+
+NODE_S = 0.1
+MARGIN_S = 2.0  # before the start and after the end, for receivers whose clocks are off
+STANDARD_GRAVITY = 9.80665
+SLOW_MPS = 0.5  # below, the track does not tell the heading
+TURN_SMOOTHING_S = 2.0  # of headings found around a standstill
+BLENDS = 3  # passes of the moving average that blends manoeuvres: the profiles become twice differentiable
+
+Follow = Literal["coordinated", "level"]
+
+
+class Waypoint(Table):
+    t_s: float
+    r_n: Vec3
+
+
+class Waypoints(Table):
+    """Through given points at given times; starts and ends without acceleration."""
+
+    kind: Literal["waypoints"]
+    points: tuple[Waypoint, ...] = Field(min_length=2)
+    attitude: Follow = "coordinated"
+    heading_deg: float = 0.0  # of a vehicle that never moves
+
+
+class Segment(Table):
+    """A manoeuvre; what is not given stays as it is."""
+
+    duration_s: PositiveFloat
+    accel_mps2: float = 0.0  # along the track
+    climb_mps: float = 0.0
+    turn_dps: float = 0.0  # positive to the right
+    bank_deg: float = Field(default=0.0, gt=-80, lt=80)  # turns as this bank does, in addition
+
+
+class Manoeuvres(Table):
+    """A table of manoeuvres, blended over `blend_s`, repeated until the end where `repeat` says so."""
+
+    kind: Literal["manoeuvres"]
+    start_n: Vec3 = (0.0, 0.0, 0.0)
+    speed_mps: float = Field(default=0.0, ge=0)
+    heading_deg: float = 0.0
+    segments: tuple[Segment, ...] = Field(min_length=1)
+    repeat: bool = False
+    blend_s: float = Field(default=4.0, ge=4 * NODE_S)
+    attitude: Follow = "coordinated"
+    sway_m: float = Field(default=0.0, ge=0)  # wandering about the table's track
+    sway_s: PositiveFloat = 30.0
+
+
+class OffsetAt(Table):
+    t_s: float
+    offset_m: Vec3
+
+
+class Formation(Table):
+    """At an offset (right, front, up) from another vehicle, constant or moving between `offsets` in straight, blended legs."""
+
+    kind: Literal["formation"]
+    leader: str
+    frame: Literal["track", "body"] = "track"  # track: level, along the leader's heading
+    offset_m: Vec3 | None = None
+    offsets: tuple[OffsetAt, ...] = ()
+    blend_s: float = Field(default=6.0, ge=4 * NODE_S)
+    attitude: Follow = "coordinated"
+    sway_m: float = Field(default=0.0, ge=0)
+    sway_s: PositiveFloat = 30.0
+
+
+class Static(Table):
+    """At rest on the Earth."""
+
+    kind: Literal["static"]
+    r_n: Vec3 = (0.0, 0.0, 0.0)
+    heading_deg: float = 0.0
+
+
+TrajectoryTable = Annotated[Waypoints | Manoeuvres | Formation | Static, Field(discriminator="kind")]
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Position, velocity, attitude of the body origin at some times, and the rate of the body against n."""
+
+    r_n: Array  # (n, 3)
+    v_n: Array  # (n, 3)
+    C_nb: Array  # (n, 3, 3)
+    w_nb_b: Array  # (n, 3)
+
+    def point(self, lever_b: Vec3) -> tuple[Array, Array]:
+        """Position and velocity (n, 3) of a point of the body."""
+        lever = np.asarray(lever_b, float)
+        return self.r_n + self.C_nb @ lever, self.v_n + np.einsum("nij,nj->ni", self.C_nb, np.cross(self.w_nb_b, lever))
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Quintic splines of position in n and of pitch, roll and heading (continuous, without jumps of 2 pi)."""
+
+    position: BSpline
+    euler: BSpline
+
+    def at(self, t_s: Array) -> Motion:
+        """The motion at any times (n,) within the flight."""
+        r, v, euler, rate = (np.asarray(s(t_s)) for s in (self.position, self.position.derivative(), self.euler, self.euler.derivative()))
+        (th, ga, psi), (dth, dga, dpsi) = euler.T, rate.T
+        # rates about the heading, then the pitch, then the roll axis, turned into the body
+        up = -dpsi * np.cos(th)
+        w = np.stack([np.cos(ga) * dth - np.sin(ga) * up, dga - dpsi * np.sin(th), np.sin(ga) * dth + np.cos(ga) * up], axis=-1)
+        return Motion(r, v, matrix_from_euler(th, ga, psi), w)
+
+    def truth(self, t_s: Array) -> Truth:
+        """The reference at times (n,)."""
+        motion = self.at(t_s)
+        return Truth(t_s, motion.r_n, motion.v_n, quat_from_matrix(motion.C_nb))
+
+
+def build(tables: dict[str, TrajectoryTable], duration_s: float, rngs: dict[str, np.random.Generator]) -> dict[str, Trajectory]:
+    """Trajectories of all vehicles by name, leaders before their followers.
+
+    rngs: one generator per vehicle, for what wanders. Raises InputError for unknown leaders and for circles of followers.
+    """
+    nodes = np.arange(-MARGIN_S, duration_s + MARGIN_S + NODE_S, NODE_S)
+    done: dict[str, Trajectory] = {}
+    left = dict(tables)
+    while left:
+        ready = [name for name, table in left.items() if not isinstance(table, Formation) or table.leader in done]
+        for name in ready:
+            done[name] = _build(name, left.pop(name), nodes, duration_s, rngs[name], done)
+        if not ready:
+            name, table = next((n, t) for n, t in left.items() if isinstance(t, Formation))
+            reason = "follows itself in a circle" if table.leader in tables else f"there are {', '.join(tables)}"
+            raise InputError(f"vehicle {name}: cannot follow {table.leader}: {reason}")
+    return {name: done[name] for name in tables}
+
+
+def _build(
+    name: str, table: TrajectoryTable, nodes: Array, duration_s: float, rng: np.random.Generator, done: dict[str, Trajectory]
+) -> Trajectory:
+    heading = None
+    if isinstance(table, Static):
+        r, heading, follow = np.tile(table.r_n, (len(nodes), 1)), np.full(len(nodes), np.deg2rad(table.heading_deg)), "level"
+    elif isinstance(table, Waypoints):
+        times = [p.t_s for p in table.points]
+        if times[0] > 0 or times[-1] < duration_s:
+            raise InputError(f"vehicle {name}: its waypoints span {times[0]:g} to {times[-1]:g} s, not the flight's 0 to {duration_s:g} s")
+        r, follow = _through(name, times, [p.r_n for p in table.points], nodes), table.attitude
+        if np.linalg.norm(np.ptp(r, axis=0)) < SLOW_MPS * NODE_S:
+            heading = np.full(len(nodes), np.deg2rad(table.heading_deg))
+    elif isinstance(table, Manoeuvres):
+        r, heading = _manoeuvred(name, table, nodes, duration_s)
+        follow = table.attitude
+        if table.sway_m > 0:
+            r, heading = r + _sway(table.sway_m, table.sway_s, nodes, rng), None
+    else:
+        r, follow = _following(name, table, nodes, rng, done[table.leader]), table.attitude
+    return _with_attitude(name, nodes, r, follow == "coordinated", heading)
+
+
+def _with_attitude(name: str, nodes: Array, r: Array, banks: bool, heading: Array | None) -> Trajectory:
+    position = make_interp_spline(nodes, r, k=5)
+    v, a = position(nodes, 1), position(nodes, 2)
+    if heading is None:
+        heading = _heading_along(name, v)
+    right = np.column_stack([np.cos(heading), -np.sin(heading)])
+    pitch = np.arctan2(v[:, 2], np.hypot(np.hypot(v[:, 0], v[:, 1]), SLOW_MPS))
+    roll = np.arctan2(np.sum(a[:, :2] * right, axis=1), STANDARD_GRAVITY + a[:, 2]) if banks else np.zeros(len(nodes))
+    return Trajectory(position, make_interp_spline(nodes, np.column_stack([pitch, roll, heading]), k=5))
+
+
+def _heading_along(name: str, v: Array) -> Array:
+    """Continuous heading (n,) of velocities; held and blended across standstills."""
+    moving = np.hypot(v[:, 0], v[:, 1]) > SLOW_MPS
+    if not np.any(moving):
+        raise InputError(f"vehicle {name} never moves faster than {SLOW_MPS} m/s: describe it as static, or by manoeuvres with a heading")
+    heading = np.interp(np.arange(len(v)), np.flatnonzero(moving), np.unwrap(np.arctan2(v[moving, 0], v[moving, 1])))
+    return heading if np.all(moving) else _blended(heading, TURN_SMOOTHING_S)
+
+
+def _blended(x: Array, width_s: float) -> Array:
+    """Moving averages over `width_s` in all; ends held."""
+    n = max(1, round(width_s / BLENDS / NODE_S)) | 1
+    for _ in range(BLENDS):
+        x = np.convolve(np.concatenate([np.full(n // 2, x[0]), x, np.full(n // 2, x[-1])]), np.full(n, 1 / n), mode="valid")
+    return x
+
+
+def _through(name: str, t_s: Sequence[float], x: Sequence[Vec3], nodes: Array) -> Array:
+    """Quintic spline through points, its second and third derivative zero at the ends; straight on beyond them."""
+    t = _increasing(name, t_s)
+    free = [(2, np.zeros(3)), (3, np.zeros(3))]
+    spline = make_interp_spline(t, np.asarray(x, float), k=5, bc_type=(free, free))
+    inside = np.clip(nodes, t[0], t[-1])
+    return np.asarray(spline(inside) + (nodes - inside)[:, None] * spline(inside, 1))
+
+
+def _increasing(name: str, t_s: Sequence[float]) -> Array:
+    t = np.asarray(t_s, float)
+    if np.any(np.diff(t) <= 0):
+        raise InputError(f"vehicle {name}: times of points must increase, got {', '.join(f'{v:g}' for v in t)}")
+    return t
+
+
+def _manoeuvred(name: str, table: Manoeuvres, nodes: Array, duration_s: float) -> tuple[Array, Array]:
+    """Position (n, 3) and heading (n,) by integrating blended profiles of acceleration, turn and climb."""
+    length = sum(s.duration_s for s in table.segments)
+    if length < duration_s and not table.repeat:
+        raise InputError(f"vehicle {name}: its manoeuvres last {length:g} s of {duration_s:g} s; add segments or set repeat = true")
+    ends = np.cumsum([s.duration_s for s in table.segments])
+    t = np.maximum(nodes, 0.0)
+    which = np.minimum(np.searchsorted(ends, np.mod(t, length) if table.repeat else t, side="right"), len(ends) - 1)
+
+    def profile(values: list[float]) -> Array:
+        return _blended(np.array(values)[which], table.blend_s)
+
+    accel, climb, turn, bank = (
+        profile([getattr(s, key) * factor for s in table.segments])
+        for key, factor in (("accel_mps2", 1.0), ("climb_mps", 1.0), ("turn_dps", np.pi / 180), ("bank_deg", np.pi / 180))
+    )
+    speed = table.speed_mps + _integral(accel, nodes)
+    if speed.min() < -0.01:
+        at = nodes[int(np.argmin(speed))]
+        raise InputError(f"vehicle {name}: its manoeuvres slow it down to {speed.min():.1f} m/s at {at:.0f} s")
+    speed = np.maximum(speed, 0.0)
+    if np.any(bank != 0):
+        turn = turn + STANDARD_GRAVITY * np.tan(bank) / np.maximum(speed, 1.0)
+    heading = np.deg2rad(table.heading_deg) + _integral(turn, nodes)
+    level = speed[:, None] * np.column_stack([np.sin(heading), np.cos(heading)])
+    r = np.column_stack([_integral(level[:, 0], nodes), _integral(level[:, 1], nodes), _integral(climb, nodes)])
+    return table.start_n + r, heading
+
+
+def _integral(x: Array, nodes: Array) -> Array:
+    """Trapezoidal integral (n,), zero at t = 0."""
+    total = np.concatenate([[0.0], np.cumsum(0.5 * (x[1:] + x[:-1]) * np.diff(nodes))])
+    return total - np.interp(0.0, nodes, total)
+
+
+def _sway(size_m: float, period_s: float, nodes: Array, rng: np.random.Generator) -> Array:
+    """Three sines per axis (n, 3) of rms `size_m` horizontally and a third of it vertically."""
+    phase, spread = rng.uniform(0, 2 * np.pi, (3, 3)), rng.uniform(0.7, 1.6, (3, 3))
+    waves = np.sin(2 * np.pi * nodes[:, None, None] / (period_s * spread) + phase)
+    return np.asarray(size_m * np.sqrt(2 / 3) * waves.sum(axis=1) * [1.0, 1.0, 1 / 3])
+
+
+def _following(name: str, table: Formation, nodes: Array, rng: np.random.Generator, leader: Trajectory) -> Array:
+    if (table.offset_m is None) == (not table.offsets):
+        raise InputError(f"vehicle {name}: give either offset_m or offsets (two or more, with times)")
+    if table.offset_m is not None:
+        offset = np.tile(table.offset_m, (len(nodes), 1))
+    elif len(table.offsets) < 2:
+        raise InputError(f"vehicle {name}: one offset needs no time: write offset_m")
+    else:
+        t = _increasing(name, [o.t_s for o in table.offsets])
+        moved = [_blended(np.interp(nodes, t, axis), table.blend_s) for axis in zip(*(o.offset_m for o in table.offsets), strict=True)]
+        offset = np.column_stack(moved)
+    offset = offset + _sway(table.sway_m, table.sway_s, nodes, rng)
+    motion = leader.at(nodes)
+    C = motion.C_nb
+    if table.frame == "track":
+        heading = np.asarray(leader.euler(nodes))[:, 2]
+        C = matrix_from_euler(np.zeros(len(nodes)), np.zeros(len(nodes)), heading)
+    return motion.r_n + np.einsum("nij,nj->ni", C, offset)

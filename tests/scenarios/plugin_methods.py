@@ -1,0 +1,60 @@
+"""Estimators that only tests use, installed through the entry-point group as a user's own would be."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+from dataclasses import replace
+
+from factorgraph.problem import NavigationProblem
+from factorgraph.registry import Progress
+from factorgraph.solution import Solution, Status
+from tests.scenarios.solution_example import example_solution
+
+
+class Example:
+    """Returns a made-up solution at once."""
+
+    summary = "made up"
+
+    def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
+        progress("making up", 0.5)
+        return replace(example_solution(n=60), name=problem.name)
+
+
+class Degraded(Example):
+    """A solution that must not be trusted blindly."""
+
+    def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
+        solution = super().solve(problem, progress)
+        diagnostics = replace(
+            solution.diagnostics, status=Status.MAX_ITERATIONS, warnings=("leader: no position from 3 s to 9 s",)
+        )
+        return replace(solution, diagnostics=diagnostics)
+
+
+class Slow(Example):
+    """Waits for Ctrl-C after it has said so in the file that SLOW_READY names."""
+
+    def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
+        with open(os.environ["SLOW_READY"], "w", encoding="utf-8") as file:
+            file.write("ready")
+        time.sleep(60)
+        return super().solve(problem, progress)
+
+
+class Crashing(Example):
+    """Reads address zero."""
+
+    def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
+        progress("reading address zero", 0.0)
+        ctypes.string_at(0)
+        return super().solve(problem, progress)
+
+
+class Buggy(Example):
+    """Raises what nobody expects."""
+
+    def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
+        raise ZeroDivisionError("an error of the estimator itself")

@@ -1,0 +1,324 @@
+"""The command line: results, exit codes, one clear line for every wrong input, interrupts, full disks, crashes."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from factorgraph.errors import InputError
+from factorgraph.problem import Settings
+from scenarios import cli, guard
+from scenarios.overrides import override
+from tests.helpers import ROOT
+
+METHODS = ("Example", "Degraded", "Slow", "Crashing", "Buggy")
+posix = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    """A flight folder with one vehicle and twenty position fixes."""
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    rows = [f"{t},{1.5 * t},{0.1 * t * t},2.0" for t in range(20)]
+    (folder / "fixes.csv").write_text("t,x,y,z\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    (folder / "flight.toml").write_text(
+        '[flight]\nname = "walk"\nt0 = "2021-09-22T06:30:00"\norigin = { lat_deg = 35.0, lon_deg = 139.0 }\n'
+        '[[vehicle]]\nname = "walker"\n[[vehicle.positions]]\nfile = "fixes.csv"\n',
+        encoding="utf-8",
+    )
+    return folder
+
+
+@pytest.fixture
+def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Installs the estimators of `plugin_methods` under their names in lower case, for child processes too."""
+    place = tmp_path / "site"
+    info = place / "plugins-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plugins\nVersion: 1.0\n", encoding="utf-8")
+    entries = [f"{name.lower()} = tests.scenarios.plugin_methods:{name}" for name in METHODS]
+    (info / "entry_points.txt").write_text("[relnav.methods]\n" + "\n".join(entries) + "\n", encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(place), str(ROOT)]))
+    monkeypatch.syspath_prepend(str(place))
+
+
+def relnav(*argv: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run the command line in a process of its own."""
+    return subprocess.run(_command(argv), capture_output=True, text=True, cwd=cwd, env=_env(), timeout=120, check=False)
+
+
+def _command(argv: tuple[object, ...]) -> list[str]:
+    return [sys.executable, "-m", "scenarios", *map(str, argv)]
+
+
+def _env() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": os.environ.get("PYTHONPATH", str(ROOT)), "PYTHONUTF8": "1"}
+
+
+def one_error_line(err: str) -> str:
+    """The only line of `err`, which must be relnav's error line."""
+    (line,) = err.splitlines()
+    assert line.startswith("relnav: error: ")
+    return line
+
+
+def test_help_names_every_command_and_every_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--help"]) == guard.DONE
+    out = capsys.readouterr().out
+    assert all(f"\n  {name}" in out for name in cli.COMMANDS)
+    assert all(f"\n  {code} " in out for code in (guard.DONE, guard.DEGRADED, guard.FAILED, guard.BUG, guard.INTERRUPTED))
+
+
+def test_examples_of_the_help_are_valid_command_lines() -> None:
+    lines = [line.split("  ")[1].split() for line in cli.EXAMPLES.splitlines()[1:]]
+    for name, command, *argv in lines:
+        assert name == "relnav"
+        assert cli._parse(cli.COMMANDS[command], argv) is not None
+
+
+def test_every_command_and_option_is_documented() -> None:
+    page = (ROOT / "docs" / "command-line.md").read_text(encoding="utf-8")
+    for command in cli.COMMANDS.values():
+        assert f"## relnav {command.name}" in page
+        parser = argparse.ArgumentParser()
+        if command.add_options is not None:
+            command.add_options(parser)
+        options = {o for action in parser._actions for o in action.option_strings if o.startswith("--")} - {"--help"}
+        assert not {o for o in options if f"`{o}" not in page}
+
+
+@pytest.mark.parametrize(
+    ("argv", "part"),
+    [
+        (["smoth"], "no command smoth, did you mean smooth?"),
+        (["smooth"], "FLIGHT"),
+        (["smooth", "a", "--metod=graph"], "unknown argument --metod=graph, did you mean --method?"),
+        (["smooth", "a", "b"], "unknown argument b"),
+        (["simulate", "two-uav"], "OUT"),
+        (["simulate", "two-uav", "out", "--seed", "x"], "--seed"),
+        (["report"], "SOLUTION"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line_and_2(argv: list[str], part: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(argv) == guard.FAILED
+    assert part in one_error_line(capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("command", ["smooth", "check"])
+def test_a_missing_flight_is_one_line_and_2(command: str, tmp_path: Path) -> None:
+    done = relnav(command, "no-such-flight", cwd=tmp_path)
+    assert done.returncode == guard.FAILED
+    assert "no-such-flight" in one_error_line(done.stderr)
+    assert not list(tmp_path.iterdir())  # and no empty folder of results
+
+
+def test_an_unknown_key_names_file_key_and_the_nearest(flight: Path) -> None:
+    file = flight / "flight.toml"
+    file.write_text(file.read_text(encoding="utf-8").replace("[[vehicle.positions]]", "[[vehicle.position]]"), encoding="utf-8")
+    done = relnav("smooth", flight, cwd=flight)
+    assert done.returncode == guard.FAILED
+    line = one_error_line(done.stderr)
+    assert "flight.toml" in line and "unknown key position" in line and "did you mean positions" in line
+
+
+def test_an_unknown_method_is_told_with_the_known_ones(flight: Path) -> None:
+    done = relnav("smooth", flight, "--method", "grap", cwd=flight)
+    assert done.returncode == guard.FAILED
+    assert "did you mean graph?" in one_error_line(done.stderr)
+
+
+def test_a_file_in_the_way_of_the_results_is_told_before_any_work(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    in_the_way = flight / "fixes.csv"
+    assert cli.main(["smooth", str(flight), "--out", str(in_the_way / "out")]) == guard.FAILED
+    assert f"{in_the_way} is a file" in one_error_line(capsys.readouterr().err)
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="a folder nobody may write in is needed, such as /proc")
+def test_a_folder_that_refuses_files_is_told_before_any_work(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["smooth", str(flight), "--out", "/proc/self/out"]) == guard.FAILED
+    assert "/proc/self/out" in one_error_line(capsys.readouterr().err)
+
+
+@pytest.mark.usefixtures("plugins")
+def test_smooth_writes_results_prints_a_summary_and_their_place(flight: Path) -> None:
+    done = relnav("smooth", flight, "--method", "example", cwd=flight)
+    assert (done.returncode, done.stderr) == (guard.DONE, "")
+    out = flight / "relnav-out" / "walk"
+    assert {path.name for path in out.iterdir()} == {"report.html", "solution", "summary.json"}
+    assert str(Path("relnav-out", "walk", "report.html")) in done.stdout
+    assert "baseline" in done.stdout
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert summary["name"] == "walk" and summary["degraded"] is False and len(summary["rows"]) > 5
+
+
+@pytest.mark.usefixtures("plugins")
+def test_a_saved_solution_gives_its_report_again(flight: Path) -> None:
+    assert relnav("smooth", flight, "--method", "example", "--no-report", "--out", "one", cwd=flight).returncode == guard.DONE
+    assert not (flight / "one" / "report.html").exists()
+    for name in ("one", "one/solution"):
+        done = relnav("report", name, cwd=flight)
+        assert (done.returncode, done.stderr) == (guard.DONE, "")
+        (flight / "one" / "report.html").unlink()
+
+
+@pytest.mark.usefixtures("plugins")
+def test_a_degraded_result_is_written_told_and_1(flight: Path) -> None:
+    done = relnav("smooth", flight, "--method", "degraded", "--out", "out", cwd=flight)
+    assert done.returncode == guard.DEGRADED
+    assert "no position from 3 s to 9 s" in done.stderr and "iteration limit" in done.stderr
+    assert (flight / "out" / "report.html").exists()
+
+
+@pytest.mark.usefixtures("plugins")
+def test_dropped_rows_are_told(flight: Path) -> None:
+    with (flight / "fixes.csv").open("a", encoding="utf-8") as file:
+        file.write("20,abc,1,2\n")
+    done = relnav("smooth", flight, "--method", "example", cwd=flight)
+    assert done.returncode == guard.DONE
+    assert "fixes.csv" in done.stderr and "dropped 1" in done.stderr
+
+
+@pytest.mark.usefixtures("plugins")
+@pytest.mark.parametrize(("failing", "left"), [("summary.json", ["solution"]), ("solution", [])])
+def test_a_full_disk_is_one_line_and_what_was_finished_survives(
+    failing: str,
+    left: list[str],
+    flight: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    from scenarios import commands
+
+    monkeypatch.setattr(commands.Outputs, "write", _full_at(failing, commands.Outputs.write))
+    out = tmp_path / "out"
+    assert _in_process(["smooth", str(flight), "--method", "example", "--out", str(out)], tmp_path) == guard.FAILED
+    line = one_error_line(capsys.readouterr().err)
+    assert os.strerror(errno.ENOSPC) in line and failing in line
+    assert (f"results so far are in {out}" if left else "nothing is written yet") in line
+    assert sorted(path.name for path in out.glob("*")) == left
+
+
+def _full_at(name: str, write: Callable[..., Path]) -> Callable[..., Path]:
+    """`Outputs.write` with a disk that is full when one result is written."""
+
+    def full(path: Path) -> None:
+        path.write_text("half of it", encoding="utf-8")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    return lambda self, result, writer: write(self, result, full if result == name else writer)
+
+
+def _in_process(argv: list[str], folder: Path) -> int:
+    """Run as the watched child does, but in this process; handlers and fault handler are put back."""
+    import faulthandler
+
+    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {name: signal.getsignal(getattr(signal, name)) for name in names}
+    try:
+        return cli.main([*argv, guard.TRACE_OPTION, str(folder / "trace.txt")])
+    finally:
+        faulthandler.enable(sys.__stderr__ or sys.stderr)
+        for name, handler in before.items():
+            signal.signal(getattr(signal, name), handler)
+
+
+@posix
+@pytest.mark.usefixtures("plugins")
+@pytest.mark.parametrize("whom", ["parent", "terminal"])
+def test_ctrl_c_stops_with_130_and_says_what_is_left(whom: str, flight: Path, tmp_path: Path) -> None:
+    ready = tmp_path / "ready"
+    env = {**_env(), "SLOW_READY": str(ready)}
+    command = _command(("smooth", flight, "--method", "slow"))
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=flight, env=env, start_new_session=True) as process:
+        _wait_for(ready)
+        started = time.monotonic()
+        (os.kill if whom == "parent" else os.killpg)(process.pid, signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == guard.INTERRUPTED
+    assert err == "relnav: stopped; nothing is written yet\n"
+    assert time.monotonic() - started < 20
+    assert not (flight / "relnav-out").exists()
+
+
+def _wait_for(path: Path) -> None:
+    deadline = time.monotonic() + 60
+    while not path.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@posix
+@pytest.mark.usefixtures("plugins")
+def test_a_crash_of_native_code_is_one_line_and_keeps_its_trace(flight: Path) -> None:
+    done = relnav("smooth", flight, "--method", "crashing", cwd=flight)
+    assert done.returncode == guard.FAILED
+    line = one_error_line(done.stderr)
+    assert "SIGSEGV" in line and "'reading address zero'" in line
+    trace = flight / "relnav-out" / "walk" / guard.CRASH_FILE
+    assert str(trace.relative_to(flight)) in line
+    assert "plugin_methods.py" in trace.read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("plugins")
+def test_an_error_in_a_method_is_a_traceback_and_3(flight: Path) -> None:
+    done = relnav("smooth", flight, "--method", "buggy", cwd=flight)
+    assert done.returncode == guard.BUG
+    assert "ZeroDivisionError" in done.stderr and "please report" in done.stderr
+
+
+@pytest.mark.usefixtures("plugins")
+def test_methods_lists_installed_ones(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["methods"]) == guard.DONE
+    out = capsys.readouterr().out
+    assert "graph" in out and "from plugins" in out
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full stands for a full disk")
+def test_results_that_cannot_be_printed_are_one_line_and_2(tmp_path: Path) -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            _command(("methods",)), stdout=full, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=_env(), check=False
+        )
+    assert done.returncode == guard.FAILED
+    one_error_line(done.stderr)
+
+
+def test_settings_change_by_dotted_keys() -> None:
+    settings = override(
+        Settings(), ["ambiguity.fix=false", "robust.code.width=3", "max_iterations=7", "robust.range.kernel=huber"]
+    )
+    assert settings.ambiguity.fix is False
+    assert settings.robust["code"].width == 3.0
+    assert settings.max_iterations == 7
+    assert settings.robust["range"].kernel == "huber"
+    assert settings.robust["phase"] == Settings().robust["phase"]
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("fix", "KEY=VALUE"),
+        ("ambigity.fix=false", "did you mean ambiguity?"),
+        ("ambiguity=1", "ambiguity.fix"),
+        ("max_iterations=seven", "integer"),
+        ("robust.code.kernel=hubr", "'huber'"),
+        ("robust.code.width=-1", "positive"),
+        ("tolerance=nan", "finite"),
+    ],
+)
+def test_a_wrong_setting_names_itself_and_what_would_help(text: str, part: str) -> None:
+    with pytest.raises(InputError) as caught:
+        override(Settings(), [text])
+    assert text in str(caught.value) and part in str(caught.value)
