@@ -28,7 +28,6 @@ OK, BAD_FLOAT, HUGE_FLOAT, BAD_COVARIANCE, ASYMMETRIC, NOT_POSITIVE, ILL_CONDITI
 SYMMETRY = 1e-6  # of sqrt(Q_ii Q_jj)
 LARGEST_FLOAT = 2.0**51  # cycles; beyond it no fraction is left
 LARGEST_ENTRY = 2.0**40  # of Z and its inverse: floats keep 12 bits of fraction
-LARGEST_SUM = 2.0**62  # of integer products
 EXCHANGE = 1.0 - 1e-6  # an exchange must shrink the conditional variance by this factor: no endless ties
 
 
@@ -74,9 +73,11 @@ def factorise(Q: Array) -> tuple[int, int, float, Array, Array, IntArray]:
     Returns code, index and value of a pivot that is not positive, U (n, n), D (n,), order (n,).
     """
     n = Q.shape[0]
-    U, D, order = np.eye(n), np.empty(n), np.arange(n)
+    U, D, order = np.zeros((n, n)), np.empty(n), np.empty(n, np.int64)
     L = np.empty((n, n))
     for i in range(n):
+        U[i, i] = 1.0
+        order[i] = i
         for j in range(i + 1):
             L[i, j] = 0.5 * (Q[i, j] + Q[j, i])
     for k in range(n - 1, -1, -1):
@@ -105,10 +106,10 @@ def factorise(Q: Array) -> tuple[int, int, float, Array, Array, IntArray]:
 
 
 @njit(cache=True)
-def _largest(row: Array) -> float:
+def _largest(row: Array, start: int) -> float:
     m = 0.0
-    for x in row:
-        m = max(m, abs(x))
+    for j in range(start, row.size):
+        m = max(m, abs(row[j]))
     return m
 
 
@@ -119,8 +120,8 @@ def _add_multiple(x: Array, m: float, y: Array) -> None:
 
 
 @njit(cache=True)
-def _swap(x: Array, y: Array) -> None:
-    for j in range(x.size):
+def _swap(x: Array, y: Array, start: int) -> None:
+    for j in range(start, x.size):
         t = x[j]
         x[j] = y[j]
         y[j] = t
@@ -133,7 +134,7 @@ def _within_bounds(UZ: Array, Y: Array, bounds: Array, k: int, i: int, m: float)
     for attempt in range(2):
         if attempt == 1:
             for r in (k, i):
-                bounds[0, r], bounds[1, r] = _largest(UZ[r, n:]), _largest(Y[r])
+                bounds[0, r], bounds[1, r] = _largest(UZ[r], n), _largest(Y[r], 0)
         z_k, y_i = bounds[0, k] + m * bounds[0, i], bounds[1, i] + m * bounds[1, k]
         if z_k <= LARGEST_ENTRY and y_i <= LARGEST_ENTRY:
             bounds[0, k], bounds[1, i] = z_k, y_i
@@ -166,11 +167,11 @@ def _exchange(UZ: Array, D: Array, Y: Array, bounds: Array, z: Array, k: int) ->
     for r in range(k):
         x, y = UZ[r, k], UZ[r, k + 1]
         UZ[r, k], UZ[r, k + 1] = y - u * x, eta * x + lam * y
-    _swap(UZ[k, k + 2 :], UZ[k + 1, k + 2 :])
-    _swap(Y[k], Y[k + 1])
+    _swap(UZ[k], UZ[k + 1], k + 2)
+    _swap(Y[k], Y[k + 1], 0)
     UZ[k, k + 1] = lam
-    for b in bounds:
-        b[k], b[k + 1] = b[k + 1], b[k]
+    for side in range(2):
+        bounds[side, k], bounds[side, k + 1] = bounds[side, k + 1], bounds[side, k]
     z[k], z[k + 1] = z[k + 1], z[k]
 
 
@@ -186,7 +187,8 @@ def reduce(a: Array, Q: Array) -> tuple[int, int, float, Array, Array, Array, Ar
     if code != OK:
         return code, index, value, UZ, D, Y, z
     for k in range(n):
-        UZ[k, :n] = U[k]
+        for j in range(k, n):
+            UZ[k, j] = U[k, j]
         UZ[k, n + order[k]] = 1.0
         Y[k, order[k]] = 1.0
         z[k] = a[order[k]]
@@ -219,9 +221,12 @@ def search(U: Array, D: Array, z_float: Array, n_candidates: int, max_nodes: int
     n = D.size
     best, norms = np.empty((n_candidates, n)), np.empty(n_candidates)
     z, centre, step, w = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    above, weight = np.zeros(n), 1.0 / D
+    above, weight = np.zeros(n), np.empty(n)
     # partial[k, j] holds sum_{i >= j} U[k, i] (z_i - centre_i); stale[k] is the highest i changed since.
-    partial, stale = np.zeros((n, n + 1)), np.full(n, n - 1)
+    partial, stale = np.zeros((n, n + 1)), np.empty(n, np.int64)
+    for j in range(n):
+        weight[j] = 1.0 / D[j]
+        stale[j] = n - 1
     found, nodes, radius = 0, 0, np.inf
     k = n - 1
     centre[k] = z_float[k]
@@ -251,10 +256,12 @@ def search(U: Array, D: Array, z_float: Array, n_candidates: int, max_nodes: int
             p = min(found, n_candidates - 1)
             while p > 0 and norms[p - 1] > norm:
                 norms[p] = norms[p - 1]
-                best[p] = best[p - 1]
+                for j in range(n):
+                    best[p, j] = best[p - 1, j]
                 p -= 1
             norms[p] = norm
-            best[p] = z
+            for j in range(n):
+                best[p, j] = z[j]
             if found < n_candidates:
                 found += 1
             if found == n_candidates:
@@ -269,10 +276,9 @@ def search(U: Array, D: Array, z_float: Array, n_candidates: int, max_nodes: int
 
 
 @njit(cache=True)
-def restore(Y: Array, z: Array, offset: Array) -> IntArray:
-    """offset + inv(Z) z, exact: overflow wraps, so sums of which only the total fits are right."""
+def restore(Y: Array, z: Array, offset: Array, a: IntArray) -> None:
+    """Fill a = offset + inv(Z) z, exact: overflow wraps, so sums of which only the total fits are right."""
     n = offset.size
-    a = np.empty(n, np.int64)
     for j in range(n):
         a[j] = np.int64(offset[j])
     for k in range(n):
@@ -280,7 +286,16 @@ def restore(Y: Array, z: Array, offset: Array) -> IntArray:
         if m != 0:
             for j in range(n):
                 a[j] += m * np.int64(Y[k, j])
-    return a
+
+
+@njit(cache=True)
+def split(a: Array) -> tuple[Array, Array]:
+    """Nearest integers and what remains of a."""
+    offset, remainder = np.empty(a.size), np.empty(a.size)
+    for i in range(a.size):
+        offset[i] = np.rint(a[i])
+        remainder[i] = a[i] - offset[i]
+    return offset, remainder
 
 
 @njit(cache=True)
@@ -293,13 +308,13 @@ def integer_least_squares(
     code, row, column, value = check(a, Q)
     if code != OK:
         return code, row, column, value, candidates, norms, False, 0
-    offset = np.rint(a)
-    code, row, value, UZ, D, Y, z = reduce(a - offset, Q)
+    offset, remainder = split(a)
+    code, row, value, UZ, D, Y, z = reduce(remainder, Q)
     if code != OK:
         return code, row, row, value, candidates, norms, False, 0
     best, norms, nodes, proven = search(UZ, D, z, n_candidates, max_nodes)
     for c in range(n_candidates):
-        candidates[c] = restore(Y, best[c], offset)
+        restore(Y, best[c], offset, candidates[c])
     return OK, 0, 0, 0.0, candidates, norms, proven, nodes
 
 
@@ -325,53 +340,3 @@ def trailing_success(D: Array) -> Array:
     for k in range(n - 1, -1, -1):
         p[k] = p[k + 1] * math.erf(1.0 / math.sqrt(8.0 * D[k]))
     return p
-
-
-@njit(cache=True)
-def ratio_of(best: float, second: float) -> float:
-    return second / best if best > 0.0 else np.inf
-
-
-@njit(cache=True)
-def fix_trailing(
-    a: Array, Q: Array, ratio_threshold: float, min_success_rate: float, max_nodes: int
-) -> tuple[int, int, int, float, int, IntArray, IntArray, IntArray, float, float, float, float, int]:
-    """Fix all of Z a, or the largest trailing part whose success rate and ratio suffice.
-
-    Returns code, row, column, value of a fault; the first fixed index (n: none), Z, inv(Z)', integers of Z a (zero where
-    not fixed), ratio and success rate of the fixed part, the same of the whole set (ratio NaN where not searched), nodes.
-    """
-    n = a.size
-    Z, Y, z = np.zeros((n, n), np.int64), np.zeros((n, n), np.int64), np.zeros(n, np.int64)
-    code, row, column, value = check(a, Q)
-    if code != OK:
-        return code, row, column, value, n, Z, Y, z, np.nan, np.nan, np.nan, np.nan, 0
-    offset = np.rint(a)
-    code, row, value, UZ, D, Y_float, z_float = reduce(a - offset, Q)
-    if code != OK:
-        return code, row, row, value, n, Z, Y, z, np.nan, np.nan, np.nan, np.nan, 0
-    for k in range(n):
-        size = 0.0
-        for j in range(n):
-            Z[k, j], Y[k, j] = np.int64(UZ[k, n + j]), np.int64(Y_float[k, j])
-            size += abs(UZ[k, n + j] * offset[j])
-        if size > LARGEST_SUM:
-            return ILL_CONDITIONED, k, 0, size, n, Z, Y, z, np.nan, np.nan, np.nan, np.nan, 0
-    success = trailing_success(D)
-    ratio, ratio_full, nodes = np.nan, np.nan, 0
-    for first in range(n):
-        if success[first] < min_success_rate:
-            continue
-        U_part = np.ascontiguousarray(UZ[first:, first:n])
-        best, norms, visited, proven = search(U_part, D[first:], z_float[first:], 2, max_nodes)
-        nodes += visited
-        ratio = ratio_of(norms[0], norms[1]) if proven else np.nan
-        if first == 0:
-            ratio_full = ratio
-        if ratio >= ratio_threshold:
-            for k in range(first, n):
-                z[k] = np.int64(best[0, k - first])
-                for j in range(n):
-                    z[k] += Z[k, j] * np.int64(offset[j])
-            return OK, 0, 0, 0.0, first, Z, Y, z, ratio, success[first], ratio_full, success[0], nodes
-    return OK, 0, 0, 0.0, n, Z, Y, z, np.nan, np.nan, ratio_full, success[0], nodes

@@ -48,11 +48,13 @@ def bootstrap(a_float: ArrayLike, Q: ArrayLike) -> Rounded:
     """
     a, Q = pair(a_float, Q)
     require_sound(a, Q)
-    offset = np.rint(a)
-    code, row, value, UZ, D, Y, z = kernels.reduce(a - offset, Q)
+    offset, remainder = kernels.split(a)
+    code, row, value, UZ, D, Y, z = kernels.reduce(remainder, Q)
     if code != kernels.OK:
         raise_fault(code, row, row, value, Q)
-    return Rounded(kernels.restore(Y, kernels.round_sequentially(UZ, z), offset), _product_of_rates(D))
+    integers = np.empty(a.size, np.int64)
+    kernels.restore(Y, kernels.round_sequentially(UZ, z), offset, integers)
+    return Rounded(integers, _product_of_rates(D))
 
 
 def success_rate(Q: ArrayLike) -> float:

@@ -22,8 +22,9 @@ from numpy.typing import ArrayLike
 from ambiguity import _kernels as kernels
 from ambiguity._input import pair, raise_fault, require_sound
 from ambiguity.types import Array, BoolArray, IntArray
-from ambiguity.validation import check_threshold
+from ambiguity.validation import check_threshold, ratio_of
 
+LARGEST_SUM = 2.0**62  # of integer products
 MAX_NODES = 1_000_000  # for each subset; one that needs more is far from fixable
 
 
@@ -76,21 +77,42 @@ def fix(
     n = a.size
     if n == 0:
         return _unfixed(0, FixStatus.NONE, np.nan, 1.0, 0)
-    code, row, column, value, first, Z, Y, z, ratio, success, ratio_all, success_all, nodes = kernels.fix_trailing(
-        a, Q, float(ratio_threshold), float(min_success_rate), int(max_nodes)
-    )
+    require_sound(a, Q)
+    offset, remainder = kernels.split(a)
+    code, row, value, UZ, D, Y, z_float = kernels.reduce(remainder, Q)
     if code != kernels.OK:
-        raise_fault(code, row, column, value, Q)
-    if first == n:
-        return _unfixed(n, FixStatus.FLOAT, ratio_all, success_all, nodes)
-    values = z @ Y  # inv(Z) z, of which only the entries determined by the fixed part are used
+        raise_fault(code, row, row, value, Q)
+    success = kernels.trailing_success(D)
+    ratio_all, nodes = np.nan, 0
+    for first in np.flatnonzero(success[:n] >= min_success_rate).tolist():
+        U = np.ascontiguousarray(UZ[first:, first:n])
+        best, norms, visited, proven = kernels.search(U, D[first:], z_float[first:], 2, int(max_nodes))
+        nodes += visited
+        ratio = ratio_of(norms) if proven else np.nan
+        if first == 0:
+            ratio_all = ratio
+        if ratio >= ratio_threshold:
+            constraints = _constraints(UZ[:, n:], Y, best[0], offset)
+            return FixResult(*constraints, ratio, float(success[first]), ratio_all, float(success[0]), nodes)
+    return _unfixed(n, FixStatus.FLOAT, ratio_all, float(success[0]), nodes)
+
+
+def _constraints(Z_float: Array, Y: Array, z: Array, offset: Array) -> tuple[FixStatus, IntArray, IntArray, BoolArray, Array]:
+    """The first five fields of a result: status, Z_fixed, z, fixed, integers, from the trailing integers of Z (a - offset)."""
+    n = len(offset)
+    first = n - len(z)
+    if np.max(np.abs(Z_float) @ np.abs(offset)) > LARGEST_SUM:
+        raise ValueError("a_float is too large for this Q: Z a exceeds 64-bit integers; remove a common offset first")
+    shift = offset.astype(np.int64)
+    z_fixed = z.astype(np.int64)
     fixed: BoolArray = ~np.any(Y[:first], axis=0)
-    if first == 0:
-        status, Z_fixed, z_fixed = FixStatus.FIXED, np.eye(n, dtype=np.int64), values
-    else:
-        status, Z_fixed, z_fixed = FixStatus.PARTIAL, Z[first:], z[first:]
+    # inv(Z) z of the fixed part is a whole ambiguity where `fixed` says so, and unused elsewhere.
+    values = z_fixed @ Y[first:].astype(np.int64) + shift
     integers = np.where(fixed, values, np.nan)
-    return FixResult(status, Z_fixed, z_fixed, fixed, integers, ratio, success, ratio_all, success_all, nodes)
+    if first == 0:
+        return FixStatus.FIXED, np.eye(n, dtype=np.int64), values, fixed, integers
+    Z_fixed = Z_float[first:].astype(np.int64)
+    return FixStatus.PARTIAL, Z_fixed, z_fixed + Z_fixed @ shift, fixed, integers
 
 
 def condition(a_float: ArrayLike, Q: ArrayLike, Z: ArrayLike, z: ArrayLike) -> tuple[Array, Array]:

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ambiguity.types import Array
+
 
 @dataclass(frozen=True, slots=True)
 class RatioTest:
@@ -38,8 +40,13 @@ def ratio_test(norms: ArrayLike, threshold: float) -> RatioTest:
     if d.ndim != 1 or d.size == 0 or not (np.all(d >= 0) and np.all(np.diff(d) >= 0)):
         raise ValueError(f"norms must be a sorted vector of squared norms, got {d}")
     check_threshold(threshold)
-    ratio = float(d[1] / d[0]) if d.size > 1 and d[0] > 0 else math.inf
+    ratio = ratio_of(d)
     return RatioTest(ratio, ratio >= threshold)
+
+
+def ratio_of(norms: Array) -> float:
+    """Second to first of sorted squared norms (k,); infinite where there is no second or the first is zero."""
+    return float(norms[1] / norms[0]) if norms.size > 1 and norms[0] > 0 else math.inf
 
 
 def check_threshold(threshold: float) -> None:

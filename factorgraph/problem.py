@@ -155,6 +155,11 @@ class Settings:
     systems: str = "GREJC"  # constellations used, RINEX letters (GLONASS: code and Doppler only)
     bands: str = "125678"  # RINEX band digits used
     use_absolute: bool = True  # undifferenced code and Doppler in the graph
+    ionosphere_model: Literal["broadcast", "none"] = "broadcast"  # Klobuchar, applied to every observation
+    ionosphere_ppm: float = 1.0  # differential vertical ionosphere per baseline length, standard deviation; 0: none
+    ionosphere_min_baseline_m: float = 10_000.0  # shorter links: antenna phase centres, which are not modelled, matter more
+    ionosphere_step_s: float = 60.0  # piecewise constant per satellite, a random walk between steps
+    ionosphere_correlation_s: float = 600.0
     ambiguity: AmbiguitySettings = AmbiguitySettings()
     robust: dict[str, Robust] = field(
         default_factory=lambda: {
@@ -167,7 +172,7 @@ class Settings:
         }
     )
     max_iterations: int = 50
-    tolerance: float = 1e-6  # relative decrease of the cost that counts as converged
+    tolerance: float = 1e-5  # relative decrease of the cost that counts as converged
     outlier_sigma: float = 4.0  # normalised residuals beyond this are listed
 
 

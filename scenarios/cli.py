@@ -89,7 +89,7 @@ def _smooth_options(parser: argparse.ArgumentParser) -> None:
 def _simulate_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenario", metavar="SCENARIO", help="a scenario file, or the name of one that comes with relnav")
     parser.add_argument("out", metavar="OUT", type=Path, help="folder the flight is written to")
-    parser.add_argument("--seed", metavar="N", type=int, help="seed of every random stream (the scenario's own)")
+    parser.add_argument("--seed", metavar="N", type=int, default=1, help="seed of every random stream (1)")
 
 
 def _check_options(parser: argparse.ArgumentParser) -> None:
@@ -123,7 +123,7 @@ COMMANDS = {
         Command(
             "simulate", "SCENARIO OUT", "write a flight with known truth", ESTIMATE, f"{DO}:simulate", _simulate_options, True
         ),
-        Command("check", "FLIGHT", "what a flight holds and what is wrong with it", LOOK, f"{DO}:check", _check_options),
+        Command("check", "FLIGHT", "what a flight holds: sensors, gaps, slips, drops", LOOK, f"{DO}:check", _check_options),
         Command("report", "SOLUTION…", "write the report of a solution again", LOOK, f"{DO}:report", _report_options),
         Command("methods", "", "list the estimators", LOOK, f"{DO}:methods"),
     )
@@ -223,9 +223,9 @@ def _call(command: Command, args: argparse.Namespace) -> int:
 
 
 def flight_name(flight: str) -> str:
-    """The name results are filed under: of the folder, or of the catalogue flight."""
+    """The name results are filed under: of the folder, the description or the catalogue flight."""
     path = Path(flight).resolve()
-    return path.parent.name if path.name == "flight.toml" else path.name
+    return path.parent.name if path.name == "flight.toml" else path.name.removesuffix(".toml")
 
 
 def check_writable(folder: Path) -> None:

@@ -1,8 +1,7 @@
 """What the commands do, after parsing: load, call, write, tell.
 
-Results go to stdout, progress and remarks to stderr. Every result is complete or absent: it is written beside its
-place and then moved there, so an interrupted run or a full disk leaves what was finished before. Heavy rooms are
-imported where they are used.
+Results go to stdout, progress and remarks to stderr. Writers put every file in place when it is complete, so an
+interrupt or a full disk leaves what was finished before. Heavy rooms are imported where they are used.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import argparse
 import dataclasses
 import json
 import math
-import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,47 +20,34 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 
 from factorgraph import registry
+from factorgraph.errors import InputError
 from factorgraph.measurements import ReadReport
 from factorgraph.solution import Solution, Status
 from scenarios import guard
 from scenarios.cli import check_writable, describe_os_error
 from scenarios.overrides import override
 
+SOLUTION = "solution"  # folder in the results
 PIPE_WIDTH = 100  # columns of a table that is not read on a terminal
 
 
 class Outputs:
     """A folder of results and what was finished in it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, unfinished: str = "nothing is written yet") -> None:
         self.folder = folder
         self.finished: list[Path] = []
+        self._unfinished = unfinished
 
-    def write(self, name: str, writer: Callable[[Path], object]) -> Path:
-        """Let `writer` write a file or folder beside its place, then move it there."""
-        path, part = self.folder / name, self.folder / f".part-{name}"
-        self.folder.mkdir(parents=True, exist_ok=True)
-        _remove(part)
-        try:
-            writer(part)
-            _remove(path)
-            part.replace(path)
-        finally:
-            _remove(part)
-        self.finished.append(path)
-        return path
+    def write(self, name: str, writer: Callable[[Path], object]) -> None:
+        """Let `writer` write a file or folder that it puts in place by itself."""
+        writer(self.folder / name)
+        self.finished.append(self.folder / name)
 
     @property
     def state(self) -> str:
         """What an early end leaves behind."""
-        return f"results so far are in {self.folder}" if self.finished else "nothing is written yet"
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+        return f"results so far are in {self.folder}" if self.finished else self._unfinished
 
 
 class Stages:
@@ -108,16 +93,29 @@ def _early_end(outputs: Outputs) -> Iterator[None]:
         raise guard.Stopped(guard.INTERRUPTED, f"stopped; {outputs.state}") from None
     except OSError as error:
         raise guard.Stopped(guard.FAILED, f"error: {describe_os_error(error)}; {outputs.state}") from error
+    except InputError as error:
+        if not outputs.finished:
+            raise
+        raise guard.Stopped(guard.FAILED, f"error: {error}; {outputs.state}") from error
 
 
 def smooth(args: argparse.Namespace) -> int:
     """Estimate a flight and write solution, trajectories, summary and report."""
     outputs = Outputs(args.out)
+    _check_replaceable(args.out / SOLUTION)
     with _early_end(outputs), Stages(args.trace) as stages:
         solution = _estimate(args, stages)
         _write_results(solution, outputs, stages, args)
     _print_summary(solution)
     return _outcome(solution, outputs, stages)
+
+
+def _check_replaceable(folder: Path) -> None:
+    """Saving a solution replaces its folder: raises InputError where that holds something else."""
+    from scenarios.solutions import TEXT
+
+    if folder.exists() and not (folder / TEXT).exists():
+        raise InputError(f"{folder} is there and not a solution that may be replaced; choose another --out")
 
 
 def _estimate(args: argparse.Namespace, stages: Stages) -> Solution:
@@ -143,11 +141,13 @@ def _tell_dropped(report: ReadReport, stages: Stages) -> None:
 
 
 def _write_results(solution: Solution, outputs: Outputs, stages: Stages, args: argparse.Namespace) -> None:
-    from scenarios import solutions
+    from scenarios import solutions, writers
 
     stages("writing the results")
-    outputs.write("solution", lambda path: solutions.save(solution, path))
-    outputs.write("summary.json", lambda path: path.write_text(json.dumps(summary(solution), indent=1) + "\n", encoding="utf-8"))
+    text = json.dumps(summary(solution), indent=1, ensure_ascii=False) + "\n"
+    outputs.write(SOLUTION, lambda path: solutions.save(solution, path))
+    outputs.write("export", lambda path: writers.write_all(solution, path))
+    outputs.write("summary.json", lambda path: solutions.replace_with(path, lambda part: part.write_text(text, encoding="utf-8")))
     if not args.no_report:
         stages("writing the report")
         _write_report(solution, outputs)
@@ -158,8 +158,9 @@ def _write_results(solution: Solution, outputs: Outputs, stages: Stages, args: a
 
 def _write_report(solution: Solution, outputs: Outputs) -> None:
     from scenarios.report.page import write_report
+    from scenarios.solutions import replace_with
 
-    outputs.write("report.html", lambda path: write_report(solution, path))
+    outputs.write("report.html", lambda path: replace_with(path, lambda part: write_report(solution, part)))
 
 
 def _write_figures(solution: Solution, outputs: Outputs) -> None:
@@ -229,12 +230,29 @@ def simulate(args: argparse.Namespace) -> int:
     from scenarios.simulate import simulate as run
     from scenarios.simulate.write import write_flight
 
-    with Stages(args.trace) as stages:
+    outputs = Outputs(args.out, unfinished=f"no complete flight is in {args.out}")
+    with _early_end(outputs), Stages(args.trace) as stages:
         stages("simulating")
         flight = run(load_scenario(args.scenario), args.seed)
         stages("writing the flight")
         write_flight(flight, args.out)
-    print(f"{args.out / 'flight.toml'}\nnow: relnav smooth {args.out}")
+    print(f"{args.out / 'flight.toml'}; next: relnav smooth {args.out}")
+    return guard.DONE
+
+
+def check(args: argparse.Namespace) -> int:
+    """Tell what a flight holds."""
+    from scenarios.flights import load
+    from scenarios.flights.check import as_json, render
+    from scenarios.flights.check import check as inspect
+
+    with Stages() as stages:
+        stages("reading the flight")
+        tables = inspect(load(args.flight, args.data))
+    if args.json:
+        print(json.dumps(as_json(tables), indent=1, ensure_ascii=False))
+    else:
+        stdout_console().print(render(tables))
     return guard.DONE
 
 
@@ -244,11 +262,11 @@ def report(args: argparse.Namespace) -> int:
 
     code = guard.DONE
     for folder in args.solutions:
-        outputs = Outputs(folder.parent if folder.name == "solution" else folder)
+        outputs = Outputs(folder.parent if folder.name == SOLUTION else folder)
         check_writable(outputs.folder)
         with _early_end(outputs), Stages() as stages:
             stages(f"reading {folder}")
-            solution = solutions.load(outputs.folder / "solution")
+            solution = solutions.load(outputs.folder / SOLUTION)
             stages("writing the report")
             _write_report(solution, outputs)
             if args.figures:

@@ -27,7 +27,7 @@ SCENARIO, SCENARIO_TEXT = "two-uav", "two UAVs, simulated: IMU, moving-base carr
 COLUMNS = {  # heading -> quantities of the summary, the first that is there
     "fixed": ("integers fixed",),
     "σ, median": ("baseline σ, median", "position σ, median"),
-    "error, RMS 3D": ("baseline error, RMS 3D", "position error, RMS 3D"),
+    "error RMS": ("baseline error RMS", "position error RMS"),
 }
 RESULTS = {guard.DONE: "done", guard.DEGRADED: "degraded", guard.INTERRUPTED: "stopped"}
 

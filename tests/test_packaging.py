@@ -121,10 +121,16 @@ def test_every_key_of_a_flight_is_documented() -> None:
 
 
 def test_the_documented_flight_parses() -> None:
-    (example,) = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "flight-folder.md").read_text(encoding="utf-8"), re.DOTALL)
+    page = (ROOT / "docs" / "flight-folder.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     flight = schema.parse(example)
     assert [vehicle.name for vehicle in flight.vehicle] == ["leader", "follower"]
     assert flight.problem_settings.ambiguity.ratio_threshold == 2.5
+
+
+def test_the_flight_of_the_readme_parses() -> None:
+    (example,) = re.findall(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert len(schema.parse(example).vehicle) == 2
 
 
 def test_links_of_the_documentation_lead_somewhere() -> None:

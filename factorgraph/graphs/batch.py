@@ -28,6 +28,7 @@ from factorgraph.types import Array
 START_MOTION = MotionPrior((3.0, 3.0, 3.0))  # for the first graph, vehicles with an IMU
 START_ROBUST = {kind: Robust("huber", 2.0) for kind in ("code", "doppler", "range", "position", "height")}
 FIX_ROUNDS = 8
+ROUGH = 1e-3  # tolerance between rounds; only the last solution needs the settings' own
 REBIAS = np.array([1e-3, 1e-3, 1e-3, 0.02, 0.02, 0.02])  # bias change that asks for preintegrating again
 
 
@@ -114,7 +115,7 @@ class Batch:
             result = self._continue(problem, graph, result, clock)
         ratio = np.nan
         if not settings.ambiguity.fix or not any(len(d.block.amb_key) for d in built.links):
-            return result, ratio
+            return self._continue(problem, graph, result, clock, settings.tolerance), ratio
         clock.stage("integers", 0.6)
         for _ in range(FIX_ROUNDS):
             if result.bayes_net is None:
@@ -128,14 +129,14 @@ class Batch:
                 result = self._continue(problem, graph, result, clock)
             if not fixed.fixed and not released:
                 break
-        return result, ratio
+        return self._continue(problem, graph, result, clock, problem.settings.tolerance), ratio
 
     def _settle(self, problem: NavigationProblem, graph: Graph, clock: _Clock) -> Result:
         """Optimise, preintegrating again while the biases move away from those preintegrated at."""
         graph.assemble()
         costs: list[float] = []
         for _ in range(5):
-            result = optimise(graph, problem.settings.robust, problem.settings.max_iterations, problem.settings.tolerance, clock.iteration)
+            result = optimise(graph, problem.settings.robust, problem.settings.max_iterations, ROUGH, clock.iteration)
             costs += result.costs
             moved = [v for v in graph.vehicles if v.mode == "imu" and np.any(np.abs(v.bias - v.preintegrated_bias).max(axis=0) > REBIAS)]
             if not moved or result.status is not Status.CONVERGED:
@@ -146,9 +147,9 @@ class Batch:
             graph.assemble()
         return Result(result.status, costs, result.bayes_net)
 
-    def _continue(self, problem: NavigationProblem, graph: Graph, before: Result, clock: _Clock) -> Result:
+    def _continue(self, problem: NavigationProblem, graph: Graph, before: Result, clock: _Clock, tolerance: float = ROUGH) -> Result:
         graph.assemble()
-        result = optimise(graph, problem.settings.robust, problem.settings.max_iterations, problem.settings.tolerance, clock.iteration)
+        result = optimise(graph, problem.settings.robust, problem.settings.max_iterations, tolerance, clock.iteration)
         return Result(result.status, before.costs + result.costs, result.bayes_net)
 
 

@@ -284,6 +284,29 @@ class MotionBlock(Block):
 
 
 @dataclass(slots=True)
+class IonosphereBlock(Block):
+    """Prior and random walk of a link's differential ionosphere: one row per variable, zero mean."""
+
+    of: GnssBlock
+    previous: IntArray  # (n,) variable before it in time of the same satellite, -1 for the first
+
+    def keys(self, f: int) -> list[int]:
+        own = int(self.of.iono_key[f])
+        return [own] if self.previous[f] < 0 else [own, int(self.of.iono_key[self.previous[f]])]
+
+    def widths(self) -> tuple[int, ...]:
+        return (1, 1)
+
+    def predict(self) -> None:
+        x = self.of.iono_value
+        self.y = -np.where(self.previous >= 0, x - x[self.previous], x)
+        self.J = np.tile([1.0, -1.0], (self.n, 1))
+
+    def columns(self, f: int) -> list[Array]:
+        return Block.columns(self, f)[: len(self.keys(f))]
+
+
+@dataclass(slots=True)
 class JointBlock(Block):
     """One empty row per state: no information, only joint elimination of two vehicles' poses and velocities."""
 
@@ -320,19 +343,43 @@ class GnssBlock(Block):
     arc: IntArray  # (n,) ambiguity arc of a phase row, -1 elsewhere
     amb_key: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (arcs,) 0: constant
     amb_value: Array = field(default_factory=lambda: np.zeros(0))  # (arcs,) cycles
+    iono: IntArray = field(init=False)  # (n,) row -> ionosphere variable, -1 none
+    iono_scale: Array = field(init=False)  # (n,) metres of this row per metre of it
+    iono_key: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    iono_value: Array = field(default_factory=lambda: np.zeros(0))  # vertical at L1, rover minus reference [m]
+    scalar_cache: dict[int, tuple[list[int], Array]] = field(default_factory=dict)  # structure of each factor, until factors are renewed
+
+    def __post_init__(self) -> None:
+        Block.__post_init__(self)
+        self.iono, self.iono_scale = np.full(self.n, -1, np.int64), np.zeros(self.n)
 
     def _ends(self) -> list[Endpoint]:
         return [self.rover] if self.reference is None else [self.rover, self.reference]
 
-    def float_arcs(self, f: int) -> IntArray:
-        i, j = self.slices(f)
-        arcs = np.unique(self.arc[i:j])
-        arcs = arcs[arcs >= 0]
-        return arcs[self.amb_key[arcs] != 0]
-
     def keys(self, f: int) -> list[int]:
         own = [k for end in self._ends() for k in end.keys(f)]
-        return [*own, *(int(k) for k in self.amb_key[self.float_arcs(f)])]
+        return [*own, *self.scalars(f)[0]]
+
+    def scalars(self, f: int) -> tuple[list[int], Array]:
+        """Keys of the ambiguities and ionospheres in factor f that are variables, and their raw columns (rows, keys)."""
+        if f not in self.scalar_cache:
+            i, j = self.slices(f)
+            arc, iono = self.arc[i:j], self.iono[i:j]
+            arcs = np.array(sorted(set(arc.tolist()) - {-1}), np.int64)
+            arcs = arcs[self.amb_key[arcs] != 0]
+            ionospheres = np.array(sorted(set(iono.tolist()) - {-1}), np.int64)
+            columns = np.hstack(
+                [
+                    np.where(arc[:, None] == arcs, self.wavelength_m[i:j, None], 0.0),
+                    np.where(iono[:, None] == ionospheres, self.iono_scale[i:j, None], 0.0),
+                ]
+            )
+            self.scalar_cache[f] = ([*self.amb_key[arcs].tolist(), *self.iono_key[ionospheres].tolist()], columns)
+        return self.scalar_cache[f]
+
+    def add_factors(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        self.scalar_cache.clear()
+        Block.add_factors(self, graph)
 
     def widths(self) -> tuple[int, ...]:
         return tuple(d for end in self._ends() for d in end.dims)
@@ -349,6 +396,8 @@ class GnssBlock(Block):
             parts.append(-J_ref)
         phase = self.arc >= 0
         y[phase] += self.wavelength_m[phase] * self.amb_value[self.arc[phase]]
+        if len(self.iono_value):
+            y += np.where(self.iono >= 0, self.iono_scale * self.iono_value[self.iono], 0.0)
         self.y = self.z - y
         self.J = np.hstack(parts)
 
@@ -366,19 +415,17 @@ class GnssBlock(Block):
         return np.where(is_rate, rate, rho), J
 
     def columns(self, f: int) -> list[Array]:
-        i, j = self.slices(f)
         own = Block.columns(self, f)
-        arcs = self.float_arcs(f)
-        if not len(arcs):
+        raw = self.scalars(f)[1]
+        if not raw.shape[1]:
             return own
-        # whitened and projected unit columns: P diag(u) lambda e_j
+        # whiten and project as the block does for its own columns
         assert self.rows.clocks is not None
-        u, clock, arc = self.u[i:j], self.rows.clocks.of_row[i:j], self.arc[i:j]
-        same = clock[:, None] == clock[None, :]
-        S = np.maximum(same @ (u * u), 1e-300)
-        lam = self.wavelength_m[i:j]
-        A = np.diag(lam * u) - np.where(same, np.outer(u / S, lam * u * u), 0.0)
-        return [*own, *(A[:, arc == a].sum(axis=1, keepdims=True) for a in arcs)]
+        i, j = self.slices(f)
+        clock = self.rows.clocks.of_row[i:j] - self.rows.clocks.of_row[i]
+        first = np.searchsorted(clock, np.arange(clock[-1] + 1))
+        raw = np.asfortranarray(CommonGroups(first, clock).project(raw, self.u[i:j]))
+        return [*own, *(raw[:, k : k + 1] for k in range(raw.shape[1]))]
 
     def refresh(self) -> None:
         for end in self._ends():

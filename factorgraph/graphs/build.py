@@ -24,6 +24,7 @@ from factorgraph.graphs.blocks import (
     Endpoint,
     GnssBlock,
     HeightBlock,
+    IonosphereBlock,
     JointBlock,
     MotionBlock,
     PositionBlock,
@@ -35,7 +36,7 @@ from factorgraph.graphs.optimizer import Graph
 from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.models.arcs import find_arcs
 from factorgraph.models.differencing import CommonGroups
-from factorgraph.models.gnss import Prepared, SinglePoint, elevation_scale, one_code_per_satellite, pair_rows, prepare, single_point, system_of
+from factorgraph.models.gnss import WAVELENGTH_L1_M, Prepared, SinglePoint, elevation_scale, one_code_per_satellite, pair_rows, prepare, single_point, system_of
 from factorgraph.problem import Link, NavigationProblem, RangeModel, Vehicle
 from factorgraph.start import interpolate
 from factorgraph.types import Array, BoolArray, IntArray
@@ -90,7 +91,8 @@ def receivers(problem: NavigationProblem) -> dict[str, Receiver]:
         stream, noise = v.gnss.stream, v.gnss.noise
         if not np.any(np.isfinite(stream.sat_pos_ecef)):
             raise InputError(f"vehicle {v.name}: no satellite has an ephemeris; check that the navigation file covers the flight's time")
-        point = single_point(stream, noise, settings.systems, stream.klobuchar, problem.t0.sow)
+        klobuchar = stream.klobuchar if settings.ionosphere_model == "broadcast" else None
+        point = single_point(stream, noise, settings.systems, klobuchar, problem.t0.sow)
         good = np.isfinite(point.clock_s)
         if not np.any(good):
             most = int(point.n_sat.max()) if len(point.n_sat) else 0
@@ -103,7 +105,7 @@ def receivers(problem: NavigationProblem) -> dict[str, Receiver]:
             r_n = np.tile(np.asarray(v.fixed_n, float), (len(stream.t_s), 1))
         else:
             r_n = interpolate(stream.t_s, stream.t_s, problem.frame.from_ecef(point.r_ecef))
-        prepared = prepare(stream, problem.frame, r_n, clock, stream.klobuchar, problem.t0.sow)
+        prepared = prepare(stream, problem.frame, r_n, clock, klobuchar, problem.t0.sow)
         usable = (
             np.isin(system_of(stream), list(settings.systems))
             & (prepared.elevation_rad >= noise.elevation_mask_rad)
@@ -115,21 +117,25 @@ def receivers(problem: NavigationProblem) -> dict[str, Receiver]:
     return out
 
 
-def _gnss_rows(kind: IntArray, group: IntArray, factor: IntArray, t: Array, sigma: Array, sat: IntArray, names: list[str], **text: object) -> Rows:
+def _gnss_rows(
+    kind: IntArray,
+    group_index: IntArray,
+    factor: IntArray,
+    t_s: Array,
+    sigma: Array,
+    *,
+    label: list[str],
+    label_index: IntArray,
+    source: str,
+    group: list[str],
+    azimuth_rad: Array,
+    elevation_rad: Array,
+) -> Rows:
     """Rows already sorted by factor, kind, group."""
-    n_groups = int(group.max()) + 1 if len(group) else 1
-    label = (factor * 3 + kind) * n_groups + group
-    return Rows(
-        kind=kind,
-        t_s=t,
-        sigma=sigma,
-        factor=CommonGroups.from_labels(factor),
-        clocks=CommonGroups.from_labels(label),
-        label=names,
-        label_index=sat,
-        group_index=group,
-        **text,  # type: ignore[arg-type]
-    )
+    n_groups = int(group_index.max()) + 1 if len(group_index) else 1
+    clocks = CommonGroups.from_labels((factor * 3 + kind) * n_groups + group_index)
+    factors = CommonGroups.from_labels(factor)
+    return Rows(kind, t_s, sigma, factors, clocks, source, label, label_index, group, group_index, azimuth_rad, elevation_rad)
 
 
 def _without_singles(order: IntArray, clock_label: IntArray) -> IntArray:
@@ -160,7 +166,7 @@ def link_block(problem: NavigationProblem, link: Link, ends: dict[str, VehicleVa
     half = ((a.stream.lli[ra] | b.stream.lli[rb]) & 2) > 0
     has_phase = np.isfinite(a.stream.phase_cyc[ra]) & np.isfinite(b.stream.phase_cyc[rb]) & ~glonass & ~half & inside & use_phase
     arcs = find_arcs(a.stream, b.stream, pairs, has_phase, settings.ambiguity)
-    length = np.bincount(arcs.of_row[arcs.of_row >= 0], minlength=arcs.count)
+    length = np.bincount(arcs.of_row[arcs.of_row >= 0], minlength=arcs.count + 1)
     arc = np.where((arcs.of_row >= 0) & (length[arcs.of_row] >= settings.ambiguity.min_arc_epochs), arcs.of_row, -1)
     observed = {
         CODE: (inside & np.isfinite(a.stream.code_m[ra]) & np.isfinite(b.stream.code_m[rb]), rov.prepared.code_m[rb] - ref.prepared.code_m[ra]),
@@ -193,8 +199,8 @@ def link_block(problem: NavigationProblem, link: Link, ends: dict[str, VehicleVa
         factor_of,
         t_rover[factor_of],
         sigma,
-        b.stream.sat[rb[row]],
-        list(b.stream.satellites),
+        label=list(b.stream.satellites),
+        label_index=b.stream.sat[rb[row]],
         source=f"{link.reference}-{link.rover}",
         group=list(pairs.group_names),
         azimuth_rad=rov.prepared.azimuth_rad[rb[row]],
@@ -272,8 +278,8 @@ def absolute_block(problem: NavigationProblem, name: str, ends: dict[str, Vehicl
         factor_of,
         times[factor_of],
         sigma,
-        stream.sat[row],
-        list(stream.satellites),
+        label=list(stream.satellites),
+        label_index=stream.sat[row],
         source=name,
         group=[str(s) for s in letters],
         azimuth_rad=rx.prepared.azimuth_rad[row],
@@ -381,6 +387,36 @@ def joint_block(a: VehicleVariables, b: VehicleVariables) -> JointBlock:
     return JointBlock(rows, a=a, b=b)
 
 
+def add_ionosphere(problem: NavigationProblem, data: GnssLink, baseline_m: float) -> IonosphereBlock | None:
+    """Give a long link's code and phase rows a differential ionosphere per satellite and time step.
+
+    Vertical at L1, scaled by the obliquity 1 + 16 (0.53 - el)^3 (el in semicircles) and (lambda / lambda_L1)^2, with plus
+    sign for code and minus for phase. Source: IS-GPS-200, 20.3.3.5.2.5, for the obliquity.
+    """
+    settings, block = problem.settings, data.block
+    if settings.ionosphere_ppm == 0 or baseline_m < settings.ionosphere_min_baseline_m:
+        return None
+    rows = block.rows
+    sign = np.select([rows.kind == CODE, rows.kind == PHASE], [1.0, -1.0], 0.0)
+    obliquity = 1 + 16 * (0.53 - rows.elevation_rad / np.pi) ** 3
+    step = np.floor((rows.t_s - rows.t_s[0]) / settings.ionosphere_step_s).astype(np.int64)
+    label = rows.label_index * (int(step.max()) + 1) + step
+    used, index = np.unique(label[sign != 0], return_inverse=True)
+    block.iono = np.full(block.n, -1, np.int64)
+    block.iono[sign != 0] = index
+    block.iono_scale = sign * obliquity * (block.wavelength_m / WAVELENGTH_L1_M) ** 2
+    block.iono_key = np.array([gtsam.symbol("i", data.key_base + k) for k in range(len(used))], np.int64)
+    block.iono_value = np.zeros(len(used))
+    sat, at = used // (int(step.max()) + 1), used % (int(step.max()) + 1)
+    follows = np.concatenate([[False], sat[1:] == sat[:-1]])
+    sigma = settings.ionosphere_ppm * 1e-6 * baseline_m
+    gap_s = np.concatenate([[0], np.diff(at)]) * settings.ionosphere_step_s
+    sigmas = np.where(follows, sigma * np.sqrt(np.maximum(gap_s, 1.0) / settings.ionosphere_correlation_s), sigma)
+    n = len(used)
+    table = _plain_rows(-1, rows.t_s[0] + at * settings.ionosphere_step_s, sigmas, np.arange(n), rows.source, ["ionosphere"], np.zeros(n, np.int64))
+    return IonosphereBlock(table, of=block, previous=np.where(follows, np.arange(n) - 1, -1))
+
+
 @dataclass(slots=True)
 class Built:
     """A graph with the parts that the ambiguity resolution and the solution refer to."""
@@ -414,13 +450,17 @@ def build(
     links: list[GnssLink] = []
     rovers = {link.rover for link in problem.links}
     key_base = 0
+    absolute: list[Block] = []
     for link in problem.links:
         if link.reference in rx and link.rover in rx:
             data = link_block(problem, link, ends, rx, key_base, use_phase)
             key_base += 1_000_000
             links.append(data)
             graph.gnss.append(data.block)
-    absolute: list[Block] = []
+            apart = float(np.linalg.norm(ends[link.rover].r - ends[link.reference].r, axis=1).max())
+            ionosphere = add_ionosphere(problem, data, apart) if use_phase else None
+            if ionosphere is not None:
+                absolute.append(ionosphere)
     for v in problem.vehicles:
         if v.name in rx and not v.is_fixed and problem.settings.use_absolute and not v.positions:
             block = absolute_block(problem, v.name, ends, rx[v.name], with_code=v.name not in rovers)

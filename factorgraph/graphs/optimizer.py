@@ -20,7 +20,7 @@ from factorgraph.problem import Robust
 from factorgraph.solution import Status
 
 LAMBDA_START, LAMBDA_MAX = 1e-4, 1e8
-DIMENSION = {"x": 6, "b": 6, "p": 3, "v": 3, "a": 1, "s": 2}  # of a variable, by the letter of its key
+DIMENSION = {"x": 6, "b": 6, "p": 3, "v": 3, "a": 1, "i": 1, "s": 2}  # of a variable, by the letter of its key
 
 
 @dataclass(slots=True)
@@ -61,6 +61,8 @@ class Graph:
                 if k in used:
                     self.values.insert(int(k), np.array([value]))
                     self.last.append(int(k))
+            for k, value in zip(gnss.iono_key, gnss.iono_value, strict=True):
+                self.values.insert(int(k), np.array([value]))
         for block in self.ranges:
             if block.parameter is not None and block.parameter not in self.last:
                 self.values.insert(block.parameter, block.value.copy())
@@ -75,6 +77,8 @@ class Graph:
             for i, k in enumerate(gnss.amb_key):
                 if k and values.exists(int(k)):
                     gnss.amb_value[i] = values.atVector(int(k))[0]
+            for i, k in enumerate(gnss.iono_key):
+                gnss.iono_value[i] = values.atVector(int(k))[0]
         for block in self.ranges:
             if block.parameter is not None:
                 block.value = values.atVector(block.parameter)
@@ -140,7 +144,8 @@ def optimise(
             if net is not None:
                 graph.take(before.retract(net.optimize()))
                 new = graph.cost(robust)
-                if np.isfinite(new) and new <= cost * (1 + 1e-9) + 1e-9:
+                # robust weights lag one iteration, so near the optimum the cost may rise by next to nothing
+                if np.isfinite(new) and new <= cost * (1 + tolerance) + 1e-6:
                     break
                 graph.take(before)
             lam = LAMBDA_START if lam == 0 else lam * 10

@@ -10,7 +10,7 @@ import numpy as np
 
 from factorgraph import geodesy
 from factorgraph.attitude import quat_from_matrix
-from factorgraph.graphs.blocks import KINDS, Block, GnssBlock, JointBlock, MotionBlock
+from factorgraph.graphs.blocks import KINDS, Block, GnssBlock, IonosphereBlock, JointBlock, MotionBlock
 from factorgraph.graphs.build import Built, GnssLink
 from factorgraph.graphs.covariance import JointCovariance
 from factorgraph.graphs.integers import tail_covariance
@@ -268,7 +268,7 @@ def _ambiguities(graph: Graph, links: list[GnssLink], result: Result) -> Ambigui
 
 
 def _measured(graph: Graph) -> list[Block]:
-    return [b for b in graph.blocks if not isinstance(b, (MotionBlock, JointBlock))]
+    return [b for b in graph.blocks if not isinstance(b, (MotionBlock, JointBlock, IonosphereBlock))]
 
 
 def _residuals(graph: Graph, outlier_sigma: float) -> ResidualTable:

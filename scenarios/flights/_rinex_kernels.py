@@ -30,7 +30,7 @@ def fixed(raw: Bytes, begin: int, end: int) -> tuple[float, int]:
         begin += 1
     digits, decimals, point, count = 0, 0, False, 0
     for k in range(begin, end):
-        c = raw[k]
+        c = int(raw[k])
         if 48 <= c <= 57 and count < 18:
             digits = 10 * digits + (c - 48)
             count += 1

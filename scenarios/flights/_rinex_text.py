@@ -28,7 +28,6 @@ class RinexText:
     data: bytes
     starts: IntArray  # (n_lines,) first byte of each line
     ends: IntArray  # (n_lines,) one past the last byte that is not blank or end of line
-    complete: bool  # the last line ends in a newline
     version: float
     kind: str  # "O" observation, "N" navigation, "G" GLONASS navigation of RINEX 2, ...
     system: str  # the header's satellite system letter
@@ -69,9 +68,7 @@ def read_rinex(path: Path) -> RinexText:
         raise InputError(f"{path}, line 1: RINEX version {first[:9].strip()!r} is not a number") from None
     if not 2.0 <= version < 5.0:
         raise InputError(f"{path}, line 1: RINEX version {version:.2f} is not supported (2, 3 and 4 are)")
-    return RinexText(
-        path, data, starts, ends, data.endswith((b"\n", b"\r")), version, first[20].upper(), first[40].upper(), header
-    )
+    return RinexText(path, data, starts, ends, version, first[20].upper(), first[40].upper(), header)
 
 
 def line_bounds(data: bytes) -> tuple[IntArray, IntArray]:

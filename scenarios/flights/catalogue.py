@@ -78,11 +78,14 @@ def _recordings(name: str, folder: str, data: Path | None) -> Path:
     """The folder `folder` of the user's recordings, or the given folder itself when it is that one."""
     root = data or (Path(os.environ[DATA_VARIABLE]) if os.environ.get(DATA_VARIABLE) else None)
     if root is None:
-        raise InputError(f"flight {name} needs recordings that do not come with relnav: give --data DIR, the folder that holds {folder}")
+        raise InputError(
+            f"flight {name}: its recordings do not come with relnav; give --data DIR, the folder that holds {folder}"
+        )
     if not root.is_dir():
         raise InputError(f"--data {root}: no such folder")
     if (root / folder).is_dir():
         return root / folder
     if root.resolve().name == folder:
         return root
-    raise InputError(f"--data {root}: no folder {folder} in it{nearest_hint(folder, sorted(p.name for p in root.iterdir() if p.is_dir()))}")
+    there = sorted(p.name for p in root.iterdir() if p.is_dir())
+    raise InputError(f"--data {root}: no folder {folder} in it{nearest_hint(folder, there) if there else ''}")

@@ -44,10 +44,11 @@ GOLDEN = (np.sqrt(5.0) - 1) / 2
 COMMENTS = (
     "Nominal constellations for simulation, not a recording.",
     "GPS: SPS Performance Standard 2001, table A-2-1.",
-    "Galileo: Walker 24/3/1. BeiDou: Walker 24/3/1, 5 GEO, 3 IGSO.",
+    "Galileo: Walker 24/3/1.",
+    "BeiDou: Walker 24/3/1, 5 geostationary, 3 inclined.",
     "QZSS: 3 inclined at 135 deg E, 1 GEO at 127 deg E.",
     "Clocks, group delays, small eccentricities: golden-section",
-    "spread of the usual size. Klobuchar: a typical winter day.",
+    "spread of the usual size. Klobuchar: likewise.",
 )
 
 
@@ -116,7 +117,9 @@ def _message(
     return row
 
 
-def _geosynchronous(system: str, k: int, longitude_deg: float, phase_deg: float, e: float, i_deg: float, perigee_deg: float) -> Array:
+def _geosynchronous(
+    system: str, k: int, longitude_deg: float, phase_deg: float, e: float, i_deg: float, perigee_deg: float
+) -> Array:
     """An orbit of one sidereal day whose ground track crosses the equator northward at longitude_deg, any phase."""
     mu, w_e = (o.MU_GPS, OMEGA_E_RPS) if system == "J" else (MU_M3S2, o.OMEGA_BDS)
     a_m = float(np.cbrt(mu / w_e**2))
@@ -125,8 +128,7 @@ def _geosynchronous(system: str, k: int, longitude_deg: float, phase_deg: float,
 
 def _bds_geostationary(k: int, longitude_deg: float) -> Array:
     """At rest over the equator: in the frame tilted by -5 deg the orbit has 5 deg inclination and its node at 180 deg."""
-    row = _message("C", k, float(np.cbrt(MU_M3S2 / o.OMEGA_BDS**2)), 0.0, 5.0, 180.0, longitude_deg - 180.0, 0.0, 0.0)
-    return row
+    return _message("C", k, float(np.cbrt(MU_M3S2 / o.OMEGA_BDS**2)), 0.0, 5.0, 180.0, longitude_deg - 180.0, 0.0, 0.0)
 
 
 def _angle(radians: float) -> float:

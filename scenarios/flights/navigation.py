@@ -122,11 +122,12 @@ class Navigation:
     def shifted_to(self, t0: GpsTime, span_s: float = 0.0) -> Navigation:
         """The same sky over the Earth, moved in time so that [t0, t0 + span_s] has valid messages.
 
-        The newest record of each satellite gets the full hour at or before t0 (of its own system time) as its reference
+        The newest record of each satellite gets the last full hour before t0 (of its own system time) as its reference
         and, for longer spans, further records every two hours that continue the same orbit; BeiDou's geostationary
         ones are held over their place. GLONASS records are moved to the last quarter of an hour and reach half an hour.
         """
-        hour = GpsTime(t0.week, np.floor(t0.sow / 3600.0) * 3600.0)
+        early = t0 + -60.0  # no receiver uses a Galileo orbit before its toe
+        hour = GpsTime(early.week, np.floor(early.sow / 3600.0) * 3600.0)
         starts_s = ISSUE_S * np.arange(max(1, int(np.ceil(((t0 - hour) + span_s) / ISSUE_S))))
         k = self.kepler
         names, toe_s, data = [], [], []

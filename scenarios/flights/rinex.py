@@ -417,7 +417,7 @@ def _assemble(
     epoch = np.concatenate([p.epoch for p in parts])
     key = (epoch * (SLOTS * len(letters)) + slot) * len(signals) + signal
     order = np.argsort(key, kind="stable")
-    repeated = np.concatenate([[False], np.diff(key[order]) == 0])
+    repeated = np.diff(key[order], prepend=-1) == 0
     tally.add("satellite twice in one epoch", int(repeated.sum()))
     order = order[~repeated]
     if not order.size:

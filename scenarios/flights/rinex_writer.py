@@ -41,7 +41,7 @@ def write_observations(
     """
     approx = stream.approx_ecef if approx_ecef is None else approx_ecef
     systems = sorted({s[0] for s in stream.satellites}, key="GREJCIS".index)
-    types = {system: tuple(s for s in stream.signals if s[0] == system) for system in systems}
+    types = {system: _types(stream, system) for system in systems}
     seconds = _calendar_ticks(t0, stream.t_s)
     present = np.unique(stream.epoch)
     lines = [
@@ -54,13 +54,12 @@ def write_observations(
         _header("".join(f"{v:14.4f}" for v in (np.zeros(3) if approx is None else approx)), "APPROX POSITION XYZ"),
         _header("".join(f"{v:14.4f}" for v in antenna_delta_m), "ANTENNA: DELTA H/E/N"),
     ]
-    for system, names in types.items():
-        kinds = [kind + s[1:] for s in names for kind in "CLDS"]
+    for system, kinds in types.items():
         for k in range(0, len(kinds), 13):
             start = f"{system}  {len(kinds):3d}" if k == 0 else " " * 6
             lines.append(_header(start + "".join(f" {t}" for t in kinds[k : k + 13]), "SYS / # / OBS TYPES"))
-    for system, names in types.items():
-        lines += [_header(f"{system} L{s[1:]}  0.00000", "SYS / PHASE SHIFT") for s in names]
+    for system, kinds in types.items():
+        lines += [_header(f"{system} {t}  0.00000", "SYS / PHASE SHIFT") for t in kinds if t[0] == "L"]
     lines.append(_header(_first_epoch(seconds[present[0]]) if present.size else "", "TIME OF FIRST OBS"))
     if "R" in systems:
         lines += _slots(channels or {})
@@ -132,10 +131,10 @@ def _epochs(stream: GnssStream, types: dict[str, tuple[str, ...]], stamps: NDArr
     """Epoch lines followed by a line per satellite."""
     group, epoch, sat = _groups(stream)
     records = np.empty(epoch.size, object)
-    for system, names in types.items():
+    for system, kinds in types.items():
         mine = np.array([s[0] == system for s in stream.satellites], bool)[sat]
         if mine.any():
-            records[mine] = _record_texts(stream, system, names, group, mine, sat)
+            records[mine] = _record_texts(stream, system, kinds, group, mine, sat)
     first = np.flatnonzero(np.diff(epoch, prepend=-1))
     counts = np.diff(first, append=epoch.size)
     lines: list[str] = []
@@ -155,30 +154,40 @@ def _groups(stream: GnssStream) -> tuple[IntArray, IntArray, IntArray]:
     return group.astype(np.int64), epoch, sat
 
 
+def _columns(stream: GnssStream) -> dict[str, Array]:
+    return {"C": stream.code_m, "L": stream.phase_cyc, "D": stream.doppler_hz, "S": stream.cn0_dbhz}
+
+
+def _types(stream: GnssStream, system: str) -> tuple[str, ...]:
+    """Observation types of a system that hold a number, signal by signal."""
+    out = []
+    for k, name in enumerate(stream.signals):
+        if name[0] == system:
+            rows = stream.signal == k
+            out += [kind + name[1:] for kind, values in _columns(stream).items() if np.isfinite(values[rows]).any()]
+    return tuple(out)
+
+
 def _record_texts(
-    stream: GnssStream, system: str, names: tuple[str, ...], group: IntArray, mine: NDArray[np.bool_], sat: IntArray
+    stream: GnssStream, system: str, kinds: tuple[str, ...], group: IntArray, mine: NDArray[np.bool_], sat: IntArray
 ) -> list[str]:
     """The lines of one system's records."""
     place = np.cumsum(mine) - 1
     text = np.array(stream.satellites)[sat[mine]].astype("U3")
-    for name in names:
-        rows = np.flatnonzero(stream.signal == stream.signals.index(name))
-        at = place[group[rows]]
-        for values, flags in (
-            (stream.code_m, None), (stream.phase_cyc, stream.lli), (stream.doppler_hz, None), (stream.cn0_dbhz, None)
-        ):  # fmt: skip
-            field = np.full(text.size, " " * 16, "U16")
-            there = np.isfinite(values[rows])
-            field[at[there]] = _fields(values[rows][there], None if flags is None else flags[rows][there])
-            text = np.char.add(text, field)
+    for kind in kinds:
+        rows = np.flatnonzero(stream.signal == stream.signals.index(system + kind[1:]))
+        values = _columns(stream)[kind[0]][rows]
+        there = np.isfinite(values)
+        field = np.full(text.size, " " * 16, "U16")
+        lli = stream.lli[rows][there] if kind[0] == "L" else np.zeros(int(there.sum()), np.int64)
+        field[place[group[rows]][there]] = _fields(values[there], lli)
+        text = np.char.add(text, field)
     return [str(t) for t in np.char.rstrip(text)]
 
 
-def _fields(values: Array, flags: IntArray | None) -> NDArray[np.str_]:
+def _fields(values: Array, lli: IntArray) -> NDArray[np.str_]:
     """F14.3, loss-of-lock digit (blank for none), blank strength."""
-    numbers = np.char.mod("%14.3f", values)
-    tail = "  " if flags is None else np.where(flags > 0, np.char.add(np.char.mod("%d", flags), " "), "  ")
-    return np.char.add(numbers, tail)
+    return np.char.add(np.char.mod("%14.3f", values), np.array(["  ", "1 ", "2 ", "3 "])[lli & 3])
 
 
 def _message(name: str, epoch: GpsTime, data: Array) -> list[str]:

@@ -46,7 +46,7 @@ class PosFile:
         if self.kind == "ecef":
             return self.position
         if self.kind == "llh":
-            return ecef_from_geodetic(*np.radians(self.position[:, :2]).T, self.position[:, 2])
+            return ecef_from_geodetic(np.radians(self.position[:, 0]), np.radians(self.position[:, 1]), self.position[:, 2])
         if self.reference_ecef is None:
             return None
         return self.reference_ecef + self.position @ _C_en(self.reference_ecef)

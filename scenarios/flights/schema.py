@@ -49,6 +49,8 @@ from factorgraph.types import Array
 FILE_NAME = "flight.toml"
 STANDARD_GRAVITY = 9.80665  # m/s^2 per g
 
+SYSTEMS = "GREJC"  # constellations an estimator may use
+
 AxisFrame = Literal["local", "ned", "ecef", "llh"]  # local: the flight's x, y, z-up; llh: degrees, degrees, metres
 Epoch = Literal["flight", "sow", "gps", "unix", "unix-gpst", "iso-gpst", "iso-utc"]
 
@@ -391,9 +393,11 @@ class Heights(TextOptions):
 
 
 class TruthTable(TextOptions):
-    """Reference trajectory of the vehicle's lever-arm origin."""
+    """Reference trajectory of the vehicle's lever-arm origin: a file, or where it stands."""
 
-    file: str
+    file: str = ""
+    ecef_m: Vec3 | None = None
+    local_m: Vec3 | None = None
     format: Literal["csv", "mat", "rtklib-pos", "nmea"] = "csv"
     time: Time = TimeColumn()
     position: Annotated[tuple[Column, ...], AfterValidator(_two_or_three)] = (1, 2, 3)  # two columns: up is 0
@@ -404,7 +408,9 @@ class TruthTable(TextOptions):
     date: str = ""
 
     @model_validator(mode="after")
-    def _attitude_frame(self) -> TruthTable:
+    def _consistent(self) -> TruthTable:
+        if bool(self.file) + (self.ecef_m is not None) + (self.local_m is not None) != 1:
+            raise InputError("truth: give file, ecef_m or local_m")
         if self.quaternion is not None and self.frame not in ("local", "ned"):
             raise InputError(f"truth: attitudes are read with frame local or ned, not {self.frame}")
         return self
@@ -508,7 +514,9 @@ class LinkTable(Table):
 def _check_settings(tree: object) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise PydanticCustomError("settings", "[settings] is a table", {})
-    _replaced(Settings(), tree, "")
+    settings: Settings = _replaced(Settings(), tree, "")
+    if not settings.systems or set(settings.systems) - set(SYSTEMS):
+        raise InputError(f'systems: "{settings.systems}" must hold letters of {SYSTEMS}, for instance "GE" for GPS and Galileo')
     return tree
 
 

@@ -18,11 +18,12 @@ from factorgraph.errors import InputError
 from factorgraph.geodesy import LocalFrame, ecef_from_geodetic
 from factorgraph.gpstime import GpsTime
 from factorgraph.measurements import HeightStream, ImuStream, PositionStream, RangeStream, ReadReport, Tag, Truth
-from factorgraph.types import Array, BoolArray
+from factorgraph.problem import Vec3
+from factorgraph.types import Array, BoolArray, IntArray
 from scenarios.flights import schema
 from scenarios.flights.nmea import NmeaPositions, read_nmea
 from scenarios.flights.rtklib_pos import PosFile, read_pos
-from scenarios.flights.schema import STANDARD_GRAVITY, axes_matrix, nearest_hint
+from scenarios.flights.schema import STANDARD_GRAVITY, axes_matrix
 from scenarios.flights.tables import RawTable, Times, ordered, read_columns, read_times, time_columns
 
 G = 9.8
@@ -67,7 +68,7 @@ class Raw:
 
 
 def _ecef_of_llh(llh_deg: Array) -> Array:
-    return ecef_from_geodetic(*np.radians(llh_deg[:, :2]).T, llh_deg[:, 2])
+    return ecef_from_geodetic(np.radians(llh_deg[:, 0]), np.radians(llh_deg[:, 1]), llh_deg[:, 2])
 
 
 def read_raw(
@@ -119,39 +120,39 @@ def imu_stream(raw: Raw, imu: schema.Imu, place: Place) -> tuple[ImuStream, Read
 
 def _check_gravity(stream: ImuStream, f_s: Array, w_s: Array, imu: schema.Imu, source: str) -> tuple[str, ...]:
     """Notes on doubtful units and axes of samples f_s, w_s (n, 3); raises InputError for certain errors."""
-    rest = _quiet(stream)
-    size = float(np.linalg.norm(f_s[rest].mean(axis=0)))
-    rate = float(np.linalg.norm(w_s[rest].mean(axis=0)))
+    size, rate = _quiet(f_s, w_s, stream.t_s)
     notes: list[str] = []
     if abs(size - G) > 0.25 * G:
-        raise InputError(f"{source}: |f| is {size:.4g} m/s2 where the IMU is quietest, expected about 9.8: {_likely_unit(size, rate, imu)}")
+        likely = _likely_unit(size, rate, imu)
+        raise InputError(f"{source}: |f| is {size:.4g} m/s2 where the IMU is quietest, expected about 9.8: {likely}")
     if abs(size - G) > 0.04 * G:
         notes.append(f"|f| is {size:.3f} m/s2 where the IMU is quietest, expected about 9.8: scale, bias, or never at rest")
     fastest = float(np.percentile(np.linalg.norm(w_s, axis=1), 99.0))
     if fastest > MAX_RATE_RPS:
-        raise InputError(
-            f'{source}: rates reach {fastest:.0f} rad/s, more than gyroscopes measure; gyro_unit = "deg/s" looks right'
-            if imu.gyro_unit == "rad/s"
-            else f"{source}: rates reach {fastest:.0f} rad/s, more than gyroscopes measure; check gyro columns and unit"
-        )
+        hint = 'gyro_unit = "deg/s" looks right' if imu.gyro_unit == "rad/s" else "check gyro columns and unit"
+        raise InputError(f"{source}: rates reach {fastest:.0f} rad/s, more than gyroscopes measure; {hint}")
     if imu.gyro_unit == "rad/s" and rate > 0.2:
         notes.append(f'the gyroscopes read {rate:.2f} rad/s where the IMU is quietest; gyro_unit = "deg/s"?')
     mean = stream.f_b.mean(axis=0)
     up = float(mean[2] / np.linalg.norm(mean))
     if up < -0.5:
-        raise InputError(f"{source}: gravity says the vehicle is upside down with axes {imu.axes}{_likely_axes(f_s.mean(axis=0), imu)}")
+        likely = _likely_axes(f_s.mean(axis=0), imu)
+        raise InputError(f"{source}: gravity says the vehicle is upside down with axes {imu.axes}{likely}")
     if up < 0.7:
-        notes.append(f"the body's up axis carries {up:.0%} of gravity with axes {imu.axes}{_likely_axes(f_s.mean(axis=0), imu)}")
+        likely = _likely_axes(f_s.mean(axis=0), imu)
+        notes.append(f"the body's up axis carries {up:.0%} of gravity with axes {imu.axes}{likely}")
     return tuple(notes)
 
 
-def _quiet(stream: ImuStream) -> slice:
-    """The stretch of about a second whose specific force scatters least."""
-    n = len(stream.t_s)
-    span = max(2, min(n, round(1.0 / max(float(np.median(np.diff(stream.t_s))), 1e-4)))) if n > 1 else n
-    blocks = stream.f_b[: n // span * span].reshape(-1, span, 3)
-    start = int(np.argmin(blocks.var(axis=1).sum(axis=1))) * span
-    return slice(start, start + span)
+def _quiet(f: Array, w: Array, t_s: Array) -> tuple[float, float]:
+    """Magnitudes of mean specific force and mean rate: medians over the quietest tenth of stretches of a second."""
+    n = len(t_s)
+    span = min(n, max(2, round(1.0 / max(float(np.median(np.diff(t_s))), 1e-4)))) if n > 1 else 1
+    whole = n // span * span
+    blocks_f, blocks_w = f[:whole].reshape(-1, span, 3), w[:whole].reshape(-1, span, 3)
+    quietest = np.argsort(blocks_f.var(axis=1).sum(axis=1))[: max(1, len(blocks_f) // 10)]
+    size, rate = (np.linalg.norm(blocks[quietest].mean(axis=1), axis=1) for blocks in (blocks_f, blocks_w))
+    return float(np.median(size)), float(np.median(rate))
 
 
 def _likely_unit(size: float, rate: float, imu: schema.Imu) -> str:
@@ -184,9 +185,9 @@ def read_positions(path: Path, p: schema.Positions) -> Raw:
     return read_raw(path, p, p.format, p.time, (*p.position, *(p.sigma or ())), day=p.date)
 
 
-def position_stream(raw: Raw, p: schema.Positions, lever_b: schema.Vec3, place: Place, path: Path) -> tuple[PositionStream, ReadReport]:
+def position_stream(raw: Raw, p: schema.Positions, lever_b: Vec3, place: Place, path: Path) -> tuple[PositionStream, ReadReport]:
     """Position fixes in n with their standard deviations per axis of n."""
-    r_n, dropped, n_rows = _positions_n(raw, p.frame, p.position, place)
+    r_n, dropped = _positions_n(raw, p.frame, p.position, place)
     sigma = _position_sigma(raw, p, place, len(r_n))
     t = raw.times.since(place.t0)
     keep, more = ordered(t, np.hstack([r_n, sigma]), str(path))
@@ -194,14 +195,14 @@ def position_stream(raw: Raw, p: schema.Positions, lever_b: schema.Vec3, place: 
     return stream, ReadReport(str(path), len(stream.t_s), {**dropped, **more})
 
 
-def _positions_n(raw: Raw, frame: str, columns: Sequence[str | int], place: Place) -> tuple[Array, dict[str, int], int]:
-    """Positions (n, 3) in the local frame, what reading dropped, and the rows of the file."""
+def _positions_n(raw: Raw, frame: str, columns: Sequence[str | int], place: Place) -> tuple[Array, dict[str, int]]:
+    """Positions (n, 3) in the local frame, and what reading dropped."""
     if raw.pos is not None:
         r_ecef = raw.pos.ecef()
         r_n = raw.pos.position if r_ecef is None else place.frame.from_ecef(r_ecef)
-        return r_n, raw.pos.dropped, raw.pos.n_rows
+        return r_n, raw.pos.dropped
     if raw.nmea is not None:
-        return place.frame.from_ecef(_ecef_of_llh(raw.nmea.llh_deg)), raw.nmea.dropped, raw.nmea.n_rows
+        return place.frame.from_ecef(_ecef_of_llh(raw.nmea.llh_deg)), raw.nmea.dropped
     table = _the_table(raw)
     cells = table.stack(columns)
     if cells.shape[1] == 2:
@@ -212,7 +213,7 @@ def _positions_n(raw: Raw, frame: str, columns: Sequence[str | int], place: Plac
         r_n = place.frame.from_ecef(cells)
     else:
         r_n = cells @ _turn(frame, place).T
-    return r_n, table.dropped, table.n_rows
+    return r_n, table.dropped
 
 
 def _turn(frame: str, place: Place) -> Array:
@@ -235,7 +236,7 @@ def read_heights(path: Path, h: schema.Heights) -> Raw:
     return read_raw(path, h, h.format, h.time, (h.height,))
 
 
-def height_stream(raw: Raw, h: schema.Heights, lever_b: schema.Vec3, place: Place) -> tuple[HeightStream, ReadReport]:
+def height_stream(raw: Raw, h: schema.Heights, lever_b: Vec3, place: Place) -> tuple[HeightStream, ReadReport]:
     """Heights above the local origin; cells outside [valid_min, valid_max] are counted."""
     table = _the_table(raw)
     cells = table.numbers[h.height]
@@ -264,7 +265,7 @@ def _thinned(t: Array, keep: BoolArray, interval_s: float) -> BoolArray:
     return thin
 
 
-def constant_heights(h: schema.Heights, lever_b: schema.Vec3, start_s: float, end_s: float) -> HeightStream:
+def constant_heights(h: schema.Heights, lever_b: Vec3, start_s: float, end_s: float) -> HeightStream:
     """The constant height at regular times over a span."""
     t = np.arange(start_s, end_s + 1e-6, h.interval_s)
     up = np.full(len(t), h.scale * (h.constant_m or 0.0) + h.offset_m)
@@ -276,12 +277,14 @@ def read_truth(path: Path, truth: schema.TruthTable) -> Raw:
     return read_raw(path, truth, truth.format, truth.time, columns, day=truth.date)
 
 
-def truth_of(raw: Raw, truth: schema.TruthTable, C_ba: Array, lever_b: Array, place: Place, path: Path) -> tuple[Truth, ReadReport]:
+def truth_of(
+    raw: Raw, truth: schema.TruthTable, C_ba: Array, lever_b: Array, place: Place, path: Path
+) -> tuple[Truth, ReadReport]:
     """Reference trajectory of the IMU.
 
     C_ba (3, 3): from the vehicle's declared axes to the body; lever_b (3,): from the declared origin to the IMU.
     """
-    r_n, dropped, n_rows = _positions_n(raw, truth.frame, truth.position, place)
+    r_n, dropped = _positions_n(raw, truth.frame, truth.position, place)
     t = raw.times.since(place.t0)
     C_nb, v_n = _truth_attitude(raw, truth, C_ba, place), _truth_velocity(raw, truth, place)
     keep, more = ordered(t, np.hstack([r_n, *(x.reshape(len(t), -1) for x in (C_nb, v_n) if x is not None)]), str(path))
@@ -298,6 +301,15 @@ def truth_of(raw: Raw, truth: schema.TruthTable, C_ba: Array, lever_b: Array, pl
     return result, ReadReport(str(path), len(result.t_s), {**dropped, **more}, notes)
 
 
+def constant_truth(truth: schema.TruthTable, t_s: Array, place: Place) -> Truth:
+    """A vehicle that stands at a known position, at times t_s (n,)."""
+    if truth.ecef_m is not None:
+        r_n = place.frame.from_ecef(np.array(truth.ecef_m))
+    else:
+        r_n = place.C_nl @ np.array(truth.local_m)
+    return Truth(t_s, np.tile(r_n, (len(t_s), 1)), np.zeros((len(t_s), 3)))
+
+
 def _truth_attitude(raw: Raw, truth: schema.TruthTable, C_ba: Array, place: Place) -> Array | None:
     if truth.quaternion is None or raw.table is None:
         return None
@@ -307,7 +319,7 @@ def _truth_attitude(raw: Raw, truth: schema.TruthTable, C_ba: Array, place: Plac
     norm = np.linalg.norm(q, axis=1, keepdims=True)
     wrong = int(np.sum(np.abs(norm - 1) > 0.01))
     if wrong > 0.5 * len(q):
-        raise InputError(f"{raw.table.path}: {wrong} of {len(q)} quaternions are not of unit length; check the columns of truth.quaternion")
+        raise InputError(f"{raw.table.path}: {wrong} of {len(q)} quaternions are not of unit length; check truth.quaternion")
     C = matrix_from_quat(np.where(np.abs(norm - 1) > 0.01, np.nan, q / np.where(norm > 0, norm, 1.0)))
     return np.asarray(_turn(truth.frame, place) @ C @ C_ba.T)
 
@@ -331,8 +343,8 @@ class _RangeRows:
     t: list[Array] = field(default_factory=list)
     r: list[Array] = field(default_factory=list)
     sigma: list[Array] = field(default_factory=list)
-    a: list[Array] = field(default_factory=list)
-    b: list[Array] = field(default_factory=list)
+    a: list[IntArray] = field(default_factory=list)
+    b: list[IntArray] = field(default_factory=list)
 
 
 def read_ranges(path: Path, ranges: schema.Ranges) -> Raw:
@@ -340,7 +352,9 @@ def read_ranges(path: Path, ranges: schema.Ranges) -> Raw:
     return read_raw(path, ranges, ranges.format, ranges.time, numbers, (ranges.tag_a, ranges.tag_b))
 
 
-def range_stream(raws: Sequence[Raw], ranges: schema.Ranges, tags: tuple[Tag, ...], place: Place) -> tuple[RangeStream, ReadReport]:
+def range_stream(
+    raws: Sequence[Raw], ranges: schema.Ranges, tags: tuple[Tag, ...], place: Place
+) -> tuple[RangeStream, ReadReport]:
     """Ranges of all files in time order; exchanges that two files log are kept once.
 
     Rows with tags that are not declared are counted. Raises InputError when no row is left.
@@ -355,13 +369,14 @@ def range_stream(raws: Sequence[Raw], ranges: schema.Ranges, tags: tuple[Tag, ..
         rows.sigma.append(np.full(table.n_rows_kept, ranges.sigma_m) if ranges.sigma is None else table.numbers[ranges.sigma])
         rows.a.append(_tag_index(table.texts[ranges.tag_a], index, unknown))
         rows.b.append(_tag_index(table.texts[ranges.tag_b], index, unknown))
-    t, r, sigma, a, b = (np.concatenate(column) for column in (rows.t, rows.r, rows.sigma, rows.a, rows.b))
+    t, r, sigma = (np.concatenate(column) for column in (rows.t, rows.r, rows.sigma))
+    a, b = np.concatenate(rows.a), np.concatenate(rows.b)
     source = ", ".join(str(_the_table(raw).path) for raw in raws)
     finite = np.isfinite(t) & np.isfinite(r) & np.isfinite(sigma) & (sigma > 0)
     declared = (a >= 0) & (b >= 0) & (a != b)
     usable = finite & declared & (r > 0)
     if not usable.any():
-        hint = f"; the file names tags {', '.join(sorted(unknown)[:10])}{nearest_hint(min(unknown), sorted(index))}" if unknown else ""
+        hint = f"; the file has tags {', '.join(sorted(unknown)[:10])}" if unknown else ""
         raise InputError(f"{source}: no range between declared tags ({', '.join(index)}){hint}")
     order = np.flatnonzero(usable)[np.argsort(t[usable], kind="stable")]
     again = _logged_twice(t[order], r[order], np.sort(np.column_stack([a[order], b[order]]), axis=1))
@@ -378,7 +393,7 @@ def range_stream(raws: Sequence[Raw], ranges: schema.Ranges, tags: tuple[Tag, ..
     return stream, ReadReport(source, len(kept), dropped)
 
 
-def _tag_index(names: np.ndarray[tuple[int], np.dtype[np.str_]], index: dict[str, int], unknown: set[str]) -> Array:
+def _tag_index(names: np.ndarray[tuple[int], np.dtype[np.str_]], index: dict[str, int], unknown: set[str]) -> IntArray:
     """Row -> declared tag, -1 for others; a numeric name such as 2.0e+00 is the tag 2."""
     distinct, inverse = np.unique(names, return_inverse=True)
     numbers = [index.get(name, index.get(_plain(name), -1)) for name in distinct.tolist()]
@@ -398,9 +413,7 @@ def _logged_twice(t: Array, r: Array, pair: Array) -> BoolArray:
     """Rows (in time order) that repeat the range of the same pair of tags within SAME_S."""
     order = np.lexsort((t, r, pair[:, 1], pair[:, 0]))
     same = np.zeros(len(t), bool)
-    same[1:] = (
-        (np.diff(pair[order], axis=0) == 0).all(axis=1) & (np.diff(r[order]) == 0) & (np.abs(np.diff(t[order])) <= SAME_S)
-    )
+    same[1:] = (np.diff(pair[order], axis=0) == 0).all(axis=1) & (np.diff(r[order]) == 0) & (np.abs(np.diff(t[order])) <= SAME_S)
     again = np.zeros(len(t), bool)
     again[order] = same
     return again

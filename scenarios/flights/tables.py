@@ -185,7 +185,7 @@ def _index(column: str | int, names: list[str], n_columns: int, path: Path) -> i
     if column in names:
         return names.index(column)
     if not names:
-        raise InputError(f"{path}: column {column} is asked by name, but the file is declared without a header; use a number from 0")
+        raise InputError(f"{path}: column {column} is named, but the file is declared without a header; use a number from 0")
     raise InputError(f"{path}: no column {column}{nearest_hint(column, names)}")
 
 
@@ -310,7 +310,7 @@ def ordered(t_s: Array, values: Array, source: str, distinct: bool = True) -> tu
             "check the time column, its unit and epoch"
         )
     if not keep.any():
-        raise InputError(f"{source}: no usable rows; {int(np.sum(~finite))} of {len(t_s)} hold cells that are empty or not numbers")
+        raise InputError(f"{source}: no usable row; {int(np.sum(~finite))} of {len(t_s)} have empty or non-numeric cells")
     counts = {
         "with empty or non-numeric cells": int(np.sum(~finite)),
         "with a repeated time stamp": n_repeated,

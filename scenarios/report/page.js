@@ -3,9 +3,10 @@
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const touch = matchMedia("(pointer: coarse)").matches;
   const narrow = matchMedia("(max-width: 760px)");
-  const timePlots = new Set();
+  const timePlots = new Map(); // plot over time -> the range it shows, "moving" while it changes
+  const inView = new Set();
+  let shared = null; // the range in time chosen last, as plotly takes it
   let charts = [];
-  let following = false;
 
   async function unpack(id) {
     const packed = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
@@ -38,16 +39,31 @@
     return chart.time ? Math.round(chart.height * 0.86) : Math.min(chart.height, div.clientWidth + 60);
   }
 
+  // Plots in view follow a zoom in time at once, the others when they come into view.
   function follow(div, change) {
-    if (following) return;
+    if (timePlots.get(div) === "moving") return;
     const range = change["xaxis.range"] || [change["xaxis.range[0]"], change["xaxis.range[1]"]];
     const reset = change["xaxis.autorange"] === true;
     if (!reset && (range[0] === undefined || range[1] === undefined)) return;
-    following = true;
-    const update = reset ? { "xaxis.autorange": true } : { "xaxis.range": [range[0], range[1]] };
-    const others = [...timePlots].filter((other) => other !== div);
-    Promise.all(others.map((other) => Plotly.relayout(other, update))).finally(() => { following = false; });
+    shared = reset ? { "xaxis.autorange": true } : { "xaxis.range": [range[0], range[1]] };
+    timePlots.set(div, shared);
+    inView.forEach(catchUp);
   }
+
+  async function catchUp(div) {
+    if (shared === null || timePlots.get(div) === shared || timePlots.get(div) === "moving") return;
+    const target = shared;
+    timePlots.set(div, "moving");
+    await Plotly.relayout(div, target);
+    timePlots.set(div, target);
+    catchUp(div);
+  }
+
+  const watchPlots = new IntersectionObserver((entries) => {
+    for (const { target, isIntersecting } of entries) {
+      if (isIntersecting) { inView.add(target); catchUp(target); } else inView.delete(target);
+    }
+  });
 
   function addTouchZoom(div) {
     const button = document.createElement("button");
@@ -79,8 +95,9 @@
     await Plotly.newPlot(div, chart.data, { ...base, ...chart.layout }, config);
     if (touch && !chart.layout.polar) addTouchZoom(div);
     if (chart.time) {
-      timePlots.add(div);
+      timePlots.set(div, null);
       div.on("plotly_relayout", (change) => follow(div, change));
+      watchPlots.observe(div);
     }
   }
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from functools import lru_cache
@@ -374,9 +374,3 @@ def _packed_plotly() -> str:
 @lru_cache
 def _asset(name: str) -> str:
     return files("scenarios.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def packed_parts(page: str) -> Iterable[str]:
-    """The unpacked contents of a page's packed parts, plotly.js first."""
-    for part in page.split('<script type="text/plain"')[1:]:
-        yield gzip.decompress(base64.b64decode(part.split(">", 1)[1].split("<", 1)[0])).decode()

@@ -27,6 +27,7 @@ from scenarios.report.series import (
     Trace,
     band,
     line,
+    normalised,
     numbers,
     plot_text,
     sample,
@@ -39,7 +40,7 @@ from scenarios.report.series import (
 
 def residuals(table: ResidualTable, outlier_sigma: float | None, limit: int) -> list[Chart]:
     """A chart for each kind: in units above, divided by the assumed sigma below."""
-    scaled = _normalised(table)
+    scaled = normalised(table)
     charts = []
     for k, kind in enumerate(table.kind):
         rows = np.flatnonzero((table.kind_index == k) & np.isfinite(table.residual))
@@ -74,7 +75,7 @@ def _drawn_note(good: int, all_good: int, strange: int, all_strange: int) -> str
 
 def histogram(table: ResidualTable) -> Chart | None:
     """Normalised residuals of each kind against the standard normal density; None without residuals."""
-    scaled, edges = _normalised(table), np.linspace(-6, 6, 61)
+    scaled, edges = normalised(table), np.linspace(-6, 6, 61)
     x = (edges[:-1] + edges[1:]) / 2
     data: list[Trace] = []
     for k, kind in enumerate(table.kind):
@@ -149,11 +150,6 @@ def cost(diagnostics: Diagnostics) -> Chart | None:
     axis = log_axis(y) if (y > 0).all() else {}
     layout = {"xaxis": {"title": {"text": "iteration"}, "tickformat": "d"}, "yaxis": {"title": {"text": "cost"}} | axis}
     return Chart("Cost of the optimisation", data, layout, 300)
-
-
-def _normalised(table: ResidualTable) -> Array:
-    usable = table.sigma > 0
-    return np.where(usable, table.residual / np.where(usable, table.sigma, 1.0), np.nan)
 
 
 def _cloud(t_s: Array, y: Array, table: ResidualTable, good: IntArray, strange: IntArray, unit: str) -> list[Trace]:

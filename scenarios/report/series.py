@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph.solution import ResidualTable
 from factorgraph.types import Array, BoolArray, IntArray
 
 Trace = dict[str, Any]
@@ -156,3 +157,9 @@ def legend_once(traces: Sequence[Trace]) -> list[Trace]:
         listed.append(trace | {"showlegend": bool(name) and name not in seen and trace.get("showlegend", True)})
         seen.add(name)
     return listed
+
+
+def normalised(table: ResidualTable) -> Array:
+    """Residuals divided by their assumed standard deviations (n,), NaN where those are not positive."""
+    usable = table.sigma > 0
+    return np.where(usable, table.residual / np.where(usable, table.sigma, 1.0), np.nan)

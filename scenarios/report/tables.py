@@ -11,6 +11,7 @@ import numpy as np
 from factorgraph.solution import AmbiguityTable, ResidualTable, Solution
 from scenarios.metrics import ErrorSeries, SummaryRow, statistics, summary_rows
 from scenarios.report.chart import UNITS
+from scenarios.report.series import normalised
 
 ROW_LIMIT = 400
 OUTLIER_LIMIT = 200
@@ -94,20 +95,19 @@ def ambiguities(found: AmbiguityTable) -> str:
 
 
 def outliers(found: ResidualTable) -> str:
-    """The largest outliers by |residual / sigma|; empty text without any."""
+    """The largest outliers by |residual / sigma|, or a line that says there are none."""
     flagged = np.flatnonzero(found.outlier)
     if not len(flagged):
         return paragraph(f"None of {len(found.t_s):,} residuals is marked as an outlier.")
-    scaled = np.abs(found.residual[flagged]) / np.where(found.sigma[flagged] > 0, found.sigma[flagged], np.nan)
-    order = flagged[np.argsort(-np.nan_to_num(scaled), kind="stable")][:OUTLIER_LIMIT]
+    scaled = normalised(found)
+    order = flagged[np.argsort(-np.nan_to_num(np.abs(scaled[flagged])), kind="stable")][:OUTLIER_LIMIT]
     head = ("kind", "source", "label", "t [s]", "residual", "unit", "σ", "residual / σ", "weight")
     rows = []
     for i in order:
         kind = found.kind[found.kind_index[i]]
-        ratio = found.residual[i] / found.sigma[i] if found.sigma[i] > 0 else float("nan")
         names = [kind, found.source[found.source_index[i]], found.label[found.label_index[i]]]
         values = [f"{found.t_s[i]:.2f}", number(found.residual[i]), UNITS.get(kind, "SI"), number(found.sigma[i], 3)]
-        rows.append([*names, *values, number(ratio, 3), number(found.weight[i], 2)])
+        rows.append([*names, *values, number(scaled[i], 3), number(found.weight[i], 2)])
     shown = f"The largest {OUTLIER_LIMIT} of {len(flagged):,}" if len(flagged) > OUTLIER_LIMIT else f"All {len(flagged):,}"
     return paragraph(f"{shown} outliers among {len(found.t_s):,} residuals.") + table(head, rows, 3)
 

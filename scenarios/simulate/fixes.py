@@ -42,7 +42,9 @@ def epochs(rate_hz: float, offset_s: float, duration_s: float) -> Array:
     return np.asarray(offset_s + np.arange(n) / rate_hz)
 
 
-def positions(table: PositionTable, trajectory: Trajectory, duration_s: float, streams: Streams, noise_scale: float) -> PositionStream:
+def positions(
+    table: PositionTable, trajectory: Trajectory, duration_s: float, streams: Streams, noise_scale: float
+) -> PositionStream:
     """Fixes of the whole flight."""
     t = epochs(table.rate_hz, table.offset_s, duration_s)
     r, _ = trajectory.at(t).point(table.lever_b)

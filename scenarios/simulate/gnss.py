@@ -148,7 +148,6 @@ class _Geometry:
     record: IntArray
     rho: Array
     rho_dot: Array
-    az: Array
     el: Array
     tropo: Array
     iono_l1: Array
@@ -161,13 +160,16 @@ def check_signals(signals: tuple[str, ...]) -> None:
             raise InputError(f'signal "{name}": write system, band and attribute of a carrier, such as "G1C", "E5Q" or "C2I"')
 
 
-def simulate(table: GnssTable, sky: Sky, trajectory: Trajectory, streams: Streams, noise_scale: float) -> tuple[Antenna, GnssRecord]:
+def simulate(
+    table: GnssTable, sky: Sky, trajectory: Trajectory, streams: Streams, noise_scale: float
+) -> tuple[Antenna, GnssRecord]:
     """Observations of the whole flight.
 
     `noise_scale` multiplies noise, multipath, outliers and satellite errors; clocks, integers and slips stay. Raises
     InputError for unknown signals or when no satellite is ever in view.
     """
     check_signals(table.signals)
+    table = table.model_copy(update={"signals": tuple(sorted(set(table.signals)))})
     noise = table.noise.noise
     t_tag = epochs(table.rate_hz, table.offset_s, sky.duration_s)
     clock_s, drift = _clock(table.clock, t_tag, streams("clock"))
@@ -180,7 +182,8 @@ def simulate(table: GnssTable, sky: Sky, trajectory: Trajectory, streams: Stream
     belongs = np.array([[signal[0] == name[0] for signal in table.signals] for name in names])
     e, s, k = np.nonzero(tracked[:, :, None] & belongs)
     if not len(e):
-        raise InputError(f"no satellite with {', '.join(table.signals)} is above {table.mask_deg:g} deg: check signals, mask and outages")
+        signals = ", ".join(table.signals)
+        raise InputError(f"no satellite with {signals} is above {table.mask_deg:g} deg: check signals, mask and outages")
 
     def drawn(source: str, draw: Callable[[np.random.Generator, int], Array]) -> Array:
         """Per row, from a stream of each satellite and signal that covers every epoch."""
@@ -197,7 +200,8 @@ def simulate(table: GnssTable, sky: Sky, trajectory: Trajectory, streams: Stream
     scale = noise_scale * elevation_scale(el)
     integer, lli, slips = _integers(table, names, tracked, t_tag, streams)
     outlier = noise_scale * drawn("outlier", lambda rng, n: _outliers(table, rng, n))
-    multipath = scale * table.multipath_m * drawn("multipath", lambda rng, n: _correlated(normal(rng, n), 1 / table.rate_hz / table.multipath_s))
+    step = 1 / (table.rate_hz * table.multipath_s)
+    multipath = scale * table.multipath_m * drawn("multipath", lambda rng, n: _correlated(normal(rng, n), step))
     sat_clock = geometry.clock_m[e, s] - sky.navigation.group_delay_m(geometry.record[e, s], table.signals, k)
     common = geometry.rho[e, s] + C_MPS * clock_s[e] - sat_clock + geometry.tropo[e, s]
     common += noise_scale * sky.satellite_error_m(names, s, t[e])
@@ -304,10 +308,21 @@ def _geometry(sky: Sky, names: tuple[str, ...], t_s: Array, r: Array, v: Array) 
     az, el = look_angles(np.einsum("nij,nj->ni", geodesy.C_en(lat, lon), e))
     tropo = sky.environment.troposphere * atmosphere.troposphere_m(lat, h, el)
     iono = np.zeros(m * S)
-    if sky.navigation.klobuchar is not None:
-        iono = sky.environment.ionosphere * atmosphere.klobuchar_m(sky.navigation.klobuchar, sky.t0.sow + t_s[epoch], lat, lon, az, el)
-    columns = (states.clock_m, states.clock_mps, states.record, C_MPS * travel, rho_dot, az, el, tropo, iono)
-    return _Geometry(states.pos_ecef.reshape(m, S, 3), states.vel_ecef.reshape(m, S, 3), *(x.reshape(m, S) for x in columns))
+    klobuchar = sky.navigation.klobuchar
+    if klobuchar is not None:
+        iono = sky.environment.ionosphere * atmosphere.klobuchar_m(klobuchar, sky.t0.sow + t_s[epoch], lat, lon, az, el)
+    return _Geometry(
+        pos=states.pos_ecef.reshape(m, S, 3),
+        vel=states.vel_ecef.reshape(m, S, 3),
+        clock_m=states.clock_m.reshape(m, S),
+        clock_mps=states.clock_mps.reshape(m, S),
+        record=states.record.reshape(m, S),
+        rho=C_MPS * travel.reshape(m, S),
+        rho_dot=rho_dot.reshape(m, S),
+        el=el.reshape(m, S),
+        tropo=tropo.reshape(m, S),
+        iono_l1=iono.reshape(m, S),
+    )
 
 
 def _turned(x: Array, travel_s: Array) -> tuple[Array, Array]:

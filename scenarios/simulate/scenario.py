@@ -21,7 +21,7 @@ from pydantic import Field, PositiveFloat, ValidationError, model_validator
 
 from factorgraph.errors import InputError
 from factorgraph.gpstime import GpsTime
-from scenarios.flights.schema import T0, LinkTable, Motion, Origin, Table, dotted, message, nearest_hint
+from scenarios.flights.schema import T0, LinkTable, Motion, Origin, Table, _message, dotted, nearest_hint
 from scenarios.simulate.fixes import HeightTable, PositionTable
 from scenarios.simulate.gnss import EnvironmentTable, GnssTable
 from scenarios.simulate.imu import ImuTable
@@ -40,7 +40,13 @@ class ScenarioInfo(Table):
     origin: Origin
     duration_s: PositiveFloat
     noise_scale: float = Field(default=1.0, ge=0)  # multiplies every random error; 0: exact measurements
-    truth_hz: PositiveFloat = 50.0  # of vehicles without an IMU; the others have it at the IMU's rate
+    truth_hz: PositiveFloat = 50.0
+
+    @model_validator(mode="after")
+    def _points_north(self) -> ScenarioInfo:
+        if self.origin.heading_deg != 0:
+            raise InputError("origin.heading_deg: simulated flights count east, north, up; leave it out")
+        return self
 
 
 class VehicleTable(Table):
@@ -108,4 +114,4 @@ def parse(text: str, source: str = "scenario") -> Scenario:
     except ValidationError as error:
         first = error.errors()[0]
         where = dotted(first["loc"])
-        raise InputError(f"{source}: {where + ': ' if where else ''}{message(first)}") from error
+        raise InputError(f"{source}: {where + ': ' if where else ''}{_message(first)}") from error

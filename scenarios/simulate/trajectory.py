@@ -128,7 +128,7 @@ class Trajectory:
 
     def at(self, t_s: Array) -> Motion:
         """The motion at any times (n,) within the flight."""
-        r, v, euler, rate = (np.asarray(s(t_s)) for s in (self.position, self.position.derivative(), self.euler, self.euler.derivative()))
+        r, v, euler, rate = (np.asarray(s(t_s, nu)) for s in (self.position, self.euler) for nu in (0, 1))
         (th, ga, psi), (dth, dga, dpsi) = euler.T, rate.T
         # rates about the heading, then the pitch, then the roll axis, turned into the body
         up = -dpsi * np.cos(th)
@@ -169,7 +169,8 @@ def _build(
     elif isinstance(table, Waypoints):
         times = [p.t_s for p in table.points]
         if times[0] > 0 or times[-1] < duration_s:
-            raise InputError(f"vehicle {name}: its waypoints span {times[0]:g} to {times[-1]:g} s, not the flight's 0 to {duration_s:g} s")
+            span = f"{times[0]:g} to {times[-1]:g} s"
+            raise InputError(f"vehicle {name}: its waypoints span {span}, not the flight's 0 to {duration_s:g} s")
         r, follow = _through(name, times, [p.r_n for p in table.points], nodes), table.attitude
         if np.linalg.norm(np.ptp(r, axis=0)) < SLOW_MPS * NODE_S:
             heading = np.full(len(nodes), np.deg2rad(table.heading_deg))
@@ -198,7 +199,7 @@ def _heading_along(name: str, v: Array) -> Array:
     """Continuous heading (n,) of velocities; held and blended across standstills."""
     moving = np.hypot(v[:, 0], v[:, 1]) > SLOW_MPS
     if not np.any(moving):
-        raise InputError(f"vehicle {name} never moves faster than {SLOW_MPS} m/s: describe it as static, or by manoeuvres with a heading")
+        raise InputError(f"vehicle {name} never moves faster than {SLOW_MPS} m/s: describe it as static or by manoeuvres")
     heading = np.interp(np.arange(len(v)), np.flatnonzero(moving), np.unwrap(np.arctan2(v[moving, 0], v[moving, 1])))
     return heading if np.all(moving) else _blended(heading, TURN_SMOOTHING_S)
 
@@ -231,7 +232,7 @@ def _manoeuvred(name: str, table: Manoeuvres, nodes: Array, duration_s: float) -
     """Position (n, 3) and heading (n,) by integrating blended profiles of acceleration, turn and climb."""
     length = sum(s.duration_s for s in table.segments)
     if length < duration_s and not table.repeat:
-        raise InputError(f"vehicle {name}: its manoeuvres last {length:g} s of {duration_s:g} s; add segments or set repeat = true")
+        raise InputError(f"vehicle {name}: its manoeuvres last {length:g} of {duration_s:g} s; add some or set repeat = true")
     ends = np.cumsum([s.duration_s for s in table.segments])
     t = np.maximum(nodes, 0.0)
     which = np.minimum(np.searchsorted(ends, np.mod(t, length) if table.repeat else t, side="right"), len(ends) - 1)
@@ -259,7 +260,7 @@ def _manoeuvred(name: str, table: Manoeuvres, nodes: Array, duration_s: float) -
 def _integral(x: Array, nodes: Array) -> Array:
     """Trapezoidal integral (n,), zero at t = 0."""
     total = np.concatenate([[0.0], np.cumsum(0.5 * (x[1:] + x[:-1]) * np.diff(nodes))])
-    return total - np.interp(0.0, nodes, total)
+    return np.asarray(total - np.interp(0.0, nodes, total))
 
 
 def _sway(size_m: float, period_s: float, nodes: Array, rng: np.random.Generator) -> Array:
@@ -278,12 +279,12 @@ def _following(name: str, table: Formation, nodes: Array, rng: np.random.Generat
         raise InputError(f"vehicle {name}: one offset needs no time: write offset_m")
     else:
         t = _increasing(name, [o.t_s for o in table.offsets])
-        moved = [_blended(np.interp(nodes, t, axis), table.blend_s) for axis in zip(*(o.offset_m for o in table.offsets), strict=True)]
-        offset = np.column_stack(moved)
+        at = np.array([o.offset_m for o in table.offsets])
+        offset = np.column_stack([_blended(np.interp(nodes, t, axis), table.blend_s) for axis in at.T])
     offset = offset + _sway(table.sway_m, table.sway_s, nodes, rng)
     motion = leader.at(nodes)
     C = motion.C_nb
     if table.frame == "track":
         heading = np.asarray(leader.euler(nodes))[:, 2]
         C = matrix_from_euler(np.zeros(len(nodes)), np.zeros(len(nodes)), heading)
-    return motion.r_n + np.einsum("nij,nj->ni", C, offset)
+    return np.asarray(motion.r_n + np.einsum("nij,nj->ni", C, offset))

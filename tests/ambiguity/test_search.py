@@ -80,7 +80,7 @@ def test_large_models_are_exact_where_rtklib_gives_up() -> None:
     rng = np.random.default_rng(77)
     n_given_up = 0
     for _ in range(60):
-        Q = double_difference_covariance(rng, *MODELS["n=40 dual"])
+        Q = double_difference_covariance(rng, (8, 8, 7), 2, 0.010, 1.5)
         a, truth = draw_float(rng, Q)
         if Rtklib(len(Q))(a, Q) is not None:
             continue

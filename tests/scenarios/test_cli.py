@@ -10,17 +10,30 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from factorgraph.errors import InputError
 from factorgraph.problem import Settings
-from scenarios import cli, guard
+from factorgraph.solution import Solution
+from scenarios import cli, demo, guard
+from scenarios.metrics import summary_rows
 from scenarios.overrides import override
 from tests.helpers import ROOT
+from tests.scenarios.solution_example import example_solution
 
+SCENARIO = """
+[scenario]
+name = "line"
+duration_s = 6.0
+origin = { lat_deg = 45.0, lon_deg = 10.0 }
+
+[[vehicle]]
+name = "walker"
+trajectory = { kind = "waypoints", points = [{ t_s = 0.0, r_n = [0, 0, 0] }, { t_s = 6.0, r_n = [6, 0, 0] }] }
+positions = [{ rate_hz = 2.0 }]
+"""
 METHODS = ("Example", "Degraded", "Slow", "Crashing", "Buggy")
 posix = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 
@@ -155,7 +168,7 @@ def test_smooth_writes_results_prints_a_summary_and_their_place(flight: Path) ->
     done = relnav("smooth", flight, "--method", "example", cwd=flight)
     assert (done.returncode, done.stderr) == (guard.DONE, "")
     out = flight / "relnav-out" / "walk"
-    assert {path.name for path in out.iterdir()} == {"report.html", "solution", "summary.json"}
+    assert {path.name for path in out.iterdir()} == {"export", "report.html", "solution", "summary.json"}
     assert str(Path("relnav-out", "walk", "report.html")) in done.stdout
     assert "baseline" in done.stdout
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
@@ -170,6 +183,13 @@ def test_a_saved_solution_gives_its_report_again(flight: Path) -> None:
         done = relnav("report", name, cwd=flight)
         assert (done.returncode, done.stderr) == (guard.DONE, "")
         (flight / "one" / "report.html").unlink()
+
+
+def test_a_folder_that_is_not_a_solution_is_not_replaced(flight: Path) -> None:
+    (flight / "solution").mkdir()
+    done = relnav("smooth", flight, "--out", ".", cwd=flight)
+    assert done.returncode == guard.FAILED
+    assert "choose another --out" in one_error_line(done.stderr)
 
 
 @pytest.mark.usefixtures("plugins")
@@ -190,48 +210,33 @@ def test_dropped_rows_are_told(flight: Path) -> None:
 
 
 @pytest.mark.usefixtures("plugins")
-@pytest.mark.parametrize(("failing", "left"), [("summary.json", ["solution"]), ("solution", [])])
+@pytest.mark.parametrize(("failing", "left"), [("writers.write_all", ["solution"]), ("solutions.save", [])])
 def test_a_full_disk_is_one_line_and_what_was_finished_survives(
-    failing: str,
-    left: list[str],
-    flight: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
+    failing: str, left: list[str], flight: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from scenarios import commands
+    def full(solution: Solution, path: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-    monkeypatch.setattr(commands.Outputs, "write", _full_at(failing, commands.Outputs.write))
-    out = tmp_path / "out"
-    assert _in_process(["smooth", str(flight), "--method", "example", "--out", str(out)], tmp_path) == guard.FAILED
+    monkeypatch.setattr(f"scenarios.{failing}", full)
+    monkeypatch.setattr(guard, "Trace", lambda path: None)  # no handlers of signals in this process
+    out = flight.parent / "out"
+    argv = ["smooth", str(flight), "--method", "example", "--out", str(out), guard.TRACE_OPTION, "unused"]
+    assert cli.main(argv) == guard.FAILED
     line = one_error_line(capsys.readouterr().err)
-    assert os.strerror(errno.ENOSPC) in line and failing in line
+    assert os.strerror(errno.ENOSPC) in line
     assert (f"results so far are in {out}" if left else "nothing is written yet") in line
     assert sorted(path.name for path in out.glob("*")) == left
 
 
-def _full_at(name: str, write: Callable[..., Path]) -> Callable[..., Path]:
-    """`Outputs.write` with a disk that is full when one result is written."""
-
-    def full(path: Path) -> None:
-        path.write_text("half of it", encoding="utf-8")
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-
-    return lambda self, result, writer: write(self, result, full if result == name else writer)
-
-
-def _in_process(argv: list[str], folder: Path) -> int:
-    """Run as the watched child does, but in this process; handlers and fault handler are put back."""
-    import faulthandler
-
-    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = {name: signal.getsignal(getattr(signal, name)) for name in names}
-    try:
-        return cli.main([*argv, guard.TRACE_OPTION, str(folder / "trace.txt")])
-    finally:
-        faulthandler.enable(sys.__stderr__ or sys.stderr)
-        for name, handler in before.items():
-            signal.signal(getattr(signal, name), handler)
+@posix
+@pytest.mark.usefixtures("plugins")
+def test_a_report_that_cannot_be_written_leaves_the_solution(flight: Path) -> None:
+    command = ["sh", "-c", 'ulimit -f 1000; exec "$@"', "sh", *_command(("smooth", flight, "--method", "example"))]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=flight, env=_env(), check=False)
+    assert done.returncode == guard.FAILED
+    line = one_error_line(done.stderr)
+    assert os.strerror(errno.EFBIG) in line and "results so far are in" in line
+    assert sorted(path.name for path in (flight / "relnav-out" / "walk").iterdir()) == ["export", "solution", "summary.json"]
 
 
 @posix
@@ -276,6 +281,46 @@ def test_an_error_in_a_method_is_a_traceback_and_3(flight: Path) -> None:
     done = relnav("smooth", flight, "--method", "buggy", cwd=flight)
     assert done.returncode == guard.BUG
     assert "ZeroDivisionError" in done.stderr and "please report" in done.stderr
+
+
+def test_check_tells_what_a_flight_holds(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", str(flight)]) == guard.DONE
+    assert "walker" in capsys.readouterr().out
+    assert cli.main(["check", str(flight), "--json"]) == guard.DONE
+    (sensor,) = json.loads(capsys.readouterr().out)["sensors"]
+    assert sensor["samples"] == 20 and sensor["from s"] == 0.0 and sensor["to s"] == 19.0
+
+
+def test_a_simulated_flight_is_one_that_check_reads(tmp_path: Path) -> None:
+    (tmp_path / "one.toml").write_text(SCENARIO, encoding="utf-8")
+    done = relnav("simulate", "one.toml", "sim", "--seed", 3, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (guard.DONE, "")
+    assert relnav("check", "sim", cwd=tmp_path).returncode == guard.DONE
+
+
+def test_a_demo_shows_every_flight_and_a_failure_hides_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    row = {"subject": "a → b", "quantity": "baseline σ, median", "value": 0.0123, "unit": "m", "text": "0.0123 m"}
+
+    def run(argv: list[str], out: Path, quiet: bool = False) -> int:
+        if argv[:2] == ["smooth", "kitti"]:
+            return guard.FAILED
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "summary.json").write_text(json.dumps({"rows": [row]}), encoding="utf-8")
+        (out / "report.html").touch()
+        return guard.DONE
+
+    monkeypatch.setattr(guard, "run", run)
+    assert cli.main(["demo", "--out", str(tmp_path)]) == guard.DEGRADED
+    out = capsys.readouterr().out
+    assert out.count("0.0123 m") == 3 and out.count("report.html") == 3
+    assert next(line for line in out.splitlines() if "kitti" in line).split("│")[2].strip() == "failed"
+
+
+def test_quantities_the_demo_shows_are_in_the_summary() -> None:
+    quantities = {row.quantity for row in summary_rows(example_solution(n=60))}
+    assert {quantity for shown in demo.COLUMNS.values() for quantity in shown} <= quantities
 
 
 @pytest.mark.usefixtures("plugins")

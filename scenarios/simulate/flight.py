@@ -1,0 +1,107 @@
+"""From a scenario and a seed to a navigation problem with truth, and a record of every error put in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph.problem import ImuNoise, Link, MotionPrior, NavigationProblem, Vehicle
+from scenarios.flights.navigation import Navigation, builtin_constellation
+from scenarios.flights.schema import Flight
+from scenarios.simulate import fixes, gnss, imu, ranging, trajectory
+from scenarios.simulate.gnss import GnssRecord, Sky
+from scenarios.simulate.imu import ImuRecord
+from scenarios.simulate.ranging import RangeRecord
+from scenarios.simulate.scenario import Scenario, VehicleTable
+from scenarios.simulate.streams import Streams
+from scenarios.simulate.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What a simulation knows and an estimator does not; keys are vehicle names."""
+
+    trajectories: dict[str, Trajectory]
+    imu: dict[str, ImuRecord]
+    gnss: dict[str, GnssRecord]
+    ranges: tuple[RangeRecord, ...]  # in the order of the problem's ranges
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedFlight:
+    """A navigation problem, where it came from, and the truth behind it."""
+
+    problem: NavigationProblem
+    record: Record
+    scenario: Scenario
+    seed: int
+    navigation: Navigation  # broadcast messages of the flight
+
+
+def simulate(scenario: Scenario, seed: int) -> SimulatedFlight:
+    """Simulate a scenario; the same seed gives the same numbers.
+
+    Raises InputError where parts of the scenario contradict each other.
+    """
+    info = scenario.scenario
+    streams = Streams(seed)
+    tables = {v.name: v.trajectory for v in scenario.vehicle}
+    trajectories = trajectory.build(tables, info.duration_s, {name: (streams / name)("motion") for name in tables})
+    sky = _sky(scenario, streams)
+    record = Record(trajectories, {}, {}, ())
+    vehicles = tuple(_vehicle(v, scenario, sky, streams / v.name, record) for v in scenario.vehicle)
+    ranges = [
+        ranging.simulate(table, trajectories, info.duration_s, streams / f"range {table.name}", info.noise_scale)
+        for table in scenario.range
+    ]
+    problem = NavigationProblem(
+        name=info.name,
+        t0=info.t0,
+        frame=sky.frame,
+        vehicles=vehicles,
+        links=tuple(Link(k.reference, k.rover) for k in scenario.link),
+        ranges=tuple(model for model, _ in ranges),
+        pairs=tuple(Link(k.reference, k.rover) for k in scenario.pair),
+        settings=Flight.model_construct(settings=scenario.settings).problem_settings,
+    )
+    return SimulatedFlight(problem, replace(record, ranges=tuple(r for _, r in ranges)), scenario, seed, sky.navigation)
+
+
+def _sky(scenario: Scenario, streams: Streams) -> Sky:
+    info, environment = scenario.scenario, scenario.environment
+    navigation = builtin_constellation().shifted_to(info.t0, info.duration_s)
+    if environment.ionosphere == 0:
+        navigation = replace(navigation, klobuchar=None)
+    return Sky(navigation, info.origin.frame, info.t0, info.duration_s, environment, streams / "satellites")
+
+
+def _vehicle(table: VehicleTable, scenario: Scenario, sky: Sky, streams: Streams, record: Record) -> Vehicle:
+    """The vehicle with its measurements; fills `record`."""
+    info, path = scenario.scenario, record.trajectories[table.name]
+    duration, scale = info.duration_s, info.noise_scale
+    imu_stream, antenna = None, None
+    if table.imu is not None:
+        imu_stream, record.imu[table.name] = imu.simulate(table.imu, path, sky.frame, duration, streams / "imu", scale)
+    if table.gnss is not None:
+        antenna, record.gnss[table.name] = gnss.simulate(table.gnss, sky, path, streams / "gnss", scale)
+    return Vehicle(
+        name=table.name,
+        imu=imu_stream,
+        imu_noise=table.imu.noise.noise if table.imu else ImuNoise(),
+        gnss=antenna,
+        positions=tuple(fixes.positions(p, path, duration, streams / p.name, scale) for p in table.positions),
+        heights=tuple(fixes.heights(h, path, duration, streams / h.name, scale) for h in table.heights),
+        motion=table.motion.prior if table.motion else MotionPrior(),
+        fixed_n=_fixed(table, path),
+        truth=path.truth(fixes.epochs(info.truth_hz, 0.0, duration)),
+        heading_hint_rad=float(path.euler(0.0)[2]) if table.heading_hint else None,
+    )
+
+
+def _fixed(table: VehicleTable, path: Trajectory) -> tuple[float, float, float] | None:
+    """The antenna's position of a base."""
+    if not table.is_base or table.gnss is None:
+        return None
+    x, y, z = path.at(np.zeros(1)).point(table.gnss.lever_b)[0][0]
+    return float(x), float(y), float(z)

@@ -1,0 +1,144 @@
+"""A simulated flight as a flight folder: flight.toml, RINEX 3 and CSV files that `scenarios.flights.load` reads back.
+
+    flight.toml             the description, written last
+    NAME.obs, flight.nav    RINEX observations of each receiver and the navigation messages of all
+    NAME-imu.csv            t_s, specific force [m/s^2], angular rate [rad/s]; right, front, up
+    NAME-truth.csv          t_s, position, velocity, attitude quaternion (scalar first)
+    NAME-SENSOR.csv         position fixes and heights
+    SENSOR.csv              ranges: t_s, from_id, to_id, range, sigma
+
+Numbers come back to the last digit, except for observations and orbits, which RINEX rounds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.csv as pacsv
+
+from factorgraph.measurements import HeightStream, ImuStream, PositionStream, RangeStream, Truth
+from factorgraph.problem import Vehicle
+from factorgraph.types import Array
+from scenarios.flights import schema
+from scenarios.flights.rinex_writer import write_navigation, write_observations
+from scenarios.simulate.flight import SimulatedFlight
+from scenarios.simulate.gnss import told
+from scenarios.simulate.scenario import VehicleTable
+
+NAVIGATION_FILE = "flight.nav"
+ACCEL, GYRO = ("f_right", "f_front", "f_up"), ("w_right", "w_front", "w_up")
+POSITION, VELOCITY = ("r_east", "r_north", "r_up"), ("v_east", "v_north", "v_up")
+QUATERNION = ("q_w", "q_x", "q_y", "q_z")
+SIGMA = ("sigma_east", "sigma_north", "sigma_up")
+Columns = Mapping[str, Array | list[str]]
+
+TIME = schema.TimeColumn(column="t_s")
+
+
+def write_flight(flight: SimulatedFlight, folder: Path) -> Path:
+    """Write the folder, made where it does not exist; returns the path of its flight.toml. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    vehicles = tuple(_vehicle(flight, table, folder) for table in flight.scenario.vehicle)
+    if any(v.gnss for v in vehicles):
+        write_navigation(folder / NAVIGATION_FILE, flight.navigation)
+    ranges = tuple(_ranges(flight, k, folder) for k in range(len(flight.problem.ranges)))
+    info = flight.scenario.scenario
+    description = schema.Flight(
+        flight=schema.FlightInfo(name=info.name, summary=info.summary, t0=info.t0, origin=info.origin),
+        vehicle=vehicles,
+        range=ranges,
+        link=flight.scenario.link,
+        pair=flight.scenario.pair,
+        settings=flight.scenario.settings,
+    )
+    path = folder / schema.FILE_NAME
+    path.write_text(schema.dump(description), encoding="utf-8")
+    return path
+
+
+def _vehicle(flight: SimulatedFlight, table: VehicleTable, folder: Path) -> schema.VehicleTable:
+    v = flight.problem.vehicle(table.name)
+    return schema.VehicleTable(
+        name=v.name,
+        imu=_imu(v.name, v.imu, folder) if v.imu else None,
+        imu_noise=table.imu.noise if table.imu else schema.ImuNoiseTable(),
+        gnss=_gnss(flight, v, table, folder),
+        positions=tuple(_positions(v.name, p, folder) for p in v.positions),
+        heights=tuple(_heights(v.name, h, folder) for h in v.heights),
+        motion=table.motion,
+        fixed=schema.Fixed(local_m=v.fixed_n) if v.fixed_n else None,
+        truth=_truth(v.name, v.truth, folder) if v.truth else None,
+        heading_hint_deg=_degrees(v.heading_hint_rad),
+    )
+
+
+def _degrees(angle_rad: float | None) -> float | None:
+    return None if angle_rad is None else math.degrees(angle_rad)
+
+
+def _named(names: tuple[str, ...], columns: Array) -> dict[str, Array]:
+    return dict(zip(names, columns.T, strict=True))
+
+
+def _columns(path: Path, columns: Columns) -> str:
+    """Write named columns; returns the file's name."""
+    pacsv.write_csv(pa.table(dict(columns)), path, pacsv.WriteOptions(quoting_style="none"))
+    return path.name
+
+
+def _imu(name: str, stream: ImuStream, folder: Path) -> schema.Imu:
+    columns = {"t_s": stream.t_s, **_named(ACCEL, stream.f_b), **_named(GYRO, stream.w_b)}
+    file = _columns(folder / f"{name}-imu.csv", columns)
+    return schema.Imu(file=file, time=TIME, accel=ACCEL, gyro=GYRO, is_mean=stream.is_mean)
+
+
+def _gnss(flight: SimulatedFlight, v: Vehicle, table: VehicleTable, folder: Path) -> schema.Gnss | None:
+    if v.gnss is None or table.gnss is None:
+        return None
+    file = f"{v.name}.obs"
+    channels = flight.navigation.glonass_channels
+    write_observations(folder / file, v.gnss.stream, flight.problem.t0, marker=v.name, channels=channels)
+    noise = table.gnss.noise.model_copy(update={"code_m": told(table.gnss).code_m})
+    return schema.Gnss(obs=file, nav=(NAVIGATION_FILE,), lever_b=v.gnss.lever_b, noise=noise)
+
+
+def _positions(name: str, stream: PositionStream, folder: Path) -> schema.Positions:
+    columns = {"t_s": stream.t_s, **_named(POSITION, stream.r_n), **_named(SIGMA, stream.sigma_m)}
+    file = _columns(folder / f"{name}-{stream.name}.csv", columns)
+    return schema.Positions(file=file, name=stream.name, time=TIME, position=POSITION, sigma=SIGMA, lever_b=stream.lever_b)
+
+
+def _heights(name: str, stream: HeightStream, folder: Path) -> schema.Heights:
+    file = _columns(folder / f"{name}-{stream.name}.csv", {"t_s": stream.t_s, "up": stream.up_m})
+    sigma = float(stream.sigma_m[0])
+    return schema.Heights(file=file, name=stream.name, time=TIME, height="up", sigma_m=sigma, lever_b=stream.lever_b)
+
+
+def _truth(name: str, truth: Truth, folder: Path) -> schema.TruthTable:
+    assert truth.v_n is not None and truth.q_nb is not None
+    columns = {"t_s": truth.t_s, **_named(POSITION, truth.r_n), **_named(VELOCITY, truth.v_n)}
+    file = _columns(folder / f"{name}-truth.csv", {**columns, **_named(QUATERNION, truth.q_nb)})
+    return schema.TruthTable(file=file, time=TIME, position=POSITION, velocity=VELOCITY, quaternion=QUATERNION)
+
+
+def _ranges(flight: SimulatedFlight, index: int, folder: Path) -> schema.Ranges:
+    table, stream = flight.scenario.range[index], flight.problem.ranges[index].stream
+    columns: Columns = {"t_s": stream.t_s, **_tag_columns(stream), "range": stream.range_m, "sigma": stream.sigma_m}
+    return schema.Ranges(
+        name=table.name,
+        files=(_columns(folder / f"{table.name}.csv", columns),),
+        time=TIME,
+        sigma="sigma",
+        tags=table.tags,
+        bias_sigma_m=table.bias_sigma_m,
+        scale_sigma=table.scale_sigma,
+        per_pair=table.per_pair,
+    )
+
+
+def _tag_columns(stream: RangeStream) -> dict[str, list[str]]:
+    names = [tag.name for tag in stream.tags]
+    return {"from_id": [names[k] for k in stream.tag_a], "to_id": [names[k] for k in stream.tag_b]}

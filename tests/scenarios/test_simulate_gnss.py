@@ -1,0 +1,197 @@
+"""GNSS observations: exact geometry without noise, statistics of noise, outliers, slips and outages."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from factorgraph.errors import InputError
+from factorgraph.gpstime import GpsTime
+from factorgraph.models.gnss import elevation_scale, prepare, single_point
+from factorgraph.problem import Antenna, GnssNoise
+from factorgraph.types import Array
+from scenarios.flights.navigation import builtin_constellation
+from scenarios.flights.schema import GnssNoiseTable, Origin
+from scenarios.simulate.gnss import EnvironmentTable, GnssRecord, GnssTable, Outage, Sky, simulate
+from scenarios.simulate.streams import Streams
+from scenarios.simulate.trajectory import Formation, Manoeuvres, Segment, Static, Trajectory, build
+
+T0 = GpsTime(2317, 300_000.0)
+ORIGIN = Origin(lat_deg=47.0, lon_deg=11.0, h_m=500.0)
+LEVER = (0.1, -0.4, 0.3)
+
+
+def sky(duration_s: float, **environment: float) -> Sky:
+    navigation = builtin_constellation().shifted_to(T0, duration_s)
+    return Sky(navigation, ORIGIN.frame, T0, duration_s, EnvironmentTable(**environment), Streams(4, "/satellites"))
+
+
+def paths(duration_s: float) -> dict[str, Trajectory]:
+    fast = Manoeuvres(
+        kind="manoeuvres", start_n=(0.0, 0.0, 900.0), speed_mps=110.0, segments=(Segment(duration_s=duration_s, turn_dps=2.0),)
+    )
+    tables = {
+        "fast": fast,
+        "near": Formation(kind="formation", leader="fast", offset_m=(40.0, -60.0, 10.0), sway_m=1.0),
+        "rest": Static(kind="static"),
+    }
+    return build(tables, duration_s, {name: np.random.default_rng(1) for name in tables})
+
+
+def observed(
+    name: str, table: GnssTable, duration_s: float, noise_scale: float, seed: int = 9, **environment: float
+) -> tuple[Antenna, GnssRecord, Trajectory]:
+    path = paths(duration_s)[name]
+    antenna, record = simulate(table, sky(duration_s, **environment), path, Streams(seed, f"/{name}/gnss"), noise_scale)
+    return antenna, record, path
+
+
+def phase_without_integers(antenna: Antenna, record: GnssRecord, path: Trajectory) -> tuple[Array, Array]:
+    """Code and phase residuals in metres of the estimators' model at the true antenna; what is left is the clock."""
+    s = antenna.stream
+    r_n, _ = path.at(s.t_s - record.clock_s).point(antenna.lever_b)
+    p = prepare(s, ORIGIN.frame, r_n, record.clock_s, s.klobuchar, T0.sow)
+    rho = np.linalg.norm(p.sat_n - r_n[s.epoch], axis=1)
+    return p.code_m - rho, p.phase_m - record.integer * s.wavelength_m - rho
+
+
+@pytest.mark.parametrize("signals", [("G1C", "G2W", "E1C"), ("C2I", "C6I", "E5Q")])
+def test_without_noise_double_differences_are_geometry(signals: tuple[str, ...]) -> None:
+    """Spec common.md, section 5: P, Phi = rho + c dt_u + T +- I (+ lambda N), at the antenna, at tag minus clock."""
+    table = GnssTable(signals=signals, lever_b=LEVER, rate_hz=2.0)
+    residuals = {}
+    for name in ("fast", "near"):
+        antenna, record, path = observed(name, table, 40.0, 0.0, satellite_error_m=1.0)
+        code, phase = phase_without_integers(antenna, record, path)
+        clock_m = record.clock_s[antenna.stream.epoch] * 299_792_458.0
+        assert np.max(np.abs(code - clock_m)) < 1e-5
+        assert np.max(np.abs(phase - clock_m)) < 1e-5
+        s = antenna.stream
+        rows = zip(s.epoch, s.sat, s.signal, strict=True)
+        residuals[name] = {(e, s.satellites[i], s.signals[j]): phase[k] for k, (e, i, j) in enumerate(rows)}
+    common = sorted(residuals["fast"].keys() & residuals["near"].keys())
+    single = np.array([residuals["near"][k] - residuals["fast"][k] for k in common])
+    epoch = np.array([k[0] for k in common])
+    double = np.concatenate([single[epoch == e][1:] - single[epoch == e][0] for e in np.unique(epoch)])
+    assert len(double) > 100 and np.max(np.abs(double)) < 1e-5
+
+
+def test_doppler_is_the_rate_of_the_phase() -> None:
+    antenna, record, _ = observed("rest", GnssTable(rate_hz=10.0, lever_b=LEVER), 10.0, 0.0)
+    s = antenna.stream
+    for i in range(len(s.satellites)):
+        rows = np.flatnonzero(s.sat == i)
+        rate = (s.phase_cyc[rows[2:]] - s.phase_cyc[rows[:-2]]) / 0.2
+        np.testing.assert_allclose(-s.doppler_hz[rows[1:-1]], rate, atol=0.02)
+    assert np.ptp(record.clock_s) > 0
+
+
+def test_single_points_find_antenna_and_clock() -> None:
+    antenna, record, path = observed("fast", GnssTable(lever_b=LEVER), 30.0, 0.0)
+    s = antenna.stream
+    point = single_point(s, antenna.noise, "GREC", s.klobuchar, T0.sow)
+    r_n, v_n = path.at(s.t_s - record.clock_s).point(LEVER)
+    np.testing.assert_allclose(ORIGIN.frame.from_ecef(point.r_ecef), r_n, atol=0.01)
+    np.testing.assert_allclose(point.clock_s, record.clock_s, atol=1e-10)
+    np.testing.assert_allclose(ORIGIN.frame.rotate_from_ecef(point.v_ecef), v_n, atol=0.1)
+
+
+def test_noise_follows_elevation_and_outliers_their_probability() -> None:
+    table = GnssTable(
+        rate_hz=5.0,
+        noise=GnssNoiseTable(code_m=0.5, phase_m=0.002, doppler_mps=0.1),
+        outlier_probability=0.02,
+        outlier_m=(8.0, 30.0),
+    )
+    (clean, _, _), (noisy, record, _) = observed("rest", table, 120.0, 0.0), observed("rest", table, 120.0, 1.0)
+    a, b = clean.stream, noisy.stream
+    scale = elevation_scale(record.elevation_rad)
+    n = b.n_rows
+    for got, sigma in (
+        (b.code_m - a.code_m - record.outlier_m, 0.5),
+        ((b.phase_cyc - a.phase_cyc) * a.wavelength_m, 0.002),
+        ((b.doppler_hz - a.doppler_hz) * a.wavelength_m, 0.1),
+    ):
+        z = got / (sigma * scale)
+        assert abs(z.std() - 1) < 4 / np.sqrt(2 * n) + 1e-3 and abs(z.mean()) < 4 / np.sqrt(n)
+    hit = record.outlier_m != 0
+    assert abs(hit.mean() - 0.02) < 4 * np.sqrt(0.02 * 0.98 / n)
+    assert np.all((np.abs(record.outlier_m[hit]) >= 8.0) & (np.abs(record.outlier_m[hit]) <= 30.0))
+    assert 0.3 < np.mean(record.outlier_m[hit] > 0) < 0.7
+
+
+def test_multipath_is_correlated_and_told_to_the_estimator() -> None:
+    table = GnssTable(rate_hz=1.0, multipath_m=1.0, multipath_s=20.0, noise=GnssNoiseTable(code_m=1e-6))
+    (clean, _, _), (dirty, record, _) = observed("rest", table, 600.0, 0.0), observed("rest", table, 600.0, 1.0)
+    z = (dirty.stream.code_m - clean.stream.code_m) / elevation_scale(record.elevation_rad)
+    lag = []
+    for i in range(len(clean.stream.satellites)):
+        x = z[clean.stream.sat == i]
+        lag.append(np.mean(x[1:] * x[:-1]) / np.mean(x * x))
+    np.testing.assert_allclose(np.mean(lag), np.exp(-1 / 20), atol=0.03)
+    np.testing.assert_allclose(z.std(), 1.0, atol=0.2)
+    assert dirty.noise == GnssNoise(code_m=float(np.hypot(1e-6, 1.0)))
+
+
+def test_slips_jump_by_integers_and_are_recorded() -> None:
+    table = GnssTable(rate_hz=5.0, slips_per_hour=60.0, lli_probability=0.6, slip_cycles=4)
+    (smooth, calm, _), (antenna, record, _) = (
+        observed("rest", GnssTable(rate_hz=5.0), 120.0, 0.0),
+        observed("rest", table, 120.0, 0.0),
+    )
+    s = antenna.stream
+    np.testing.assert_allclose(s.phase_cyc - smooth.stream.phase_cyc, record.integer - calm.integer, atol=1e-6)
+    hours = s.n_rows / 5.0 / 3600.0
+    assert abs(len(record.slips) - 60 * hours) < 4 * np.sqrt(60 * hours)
+    flagged = np.mean([slip.flagged for slip in record.slips])
+    assert abs(flagged - 0.6) < 4 * np.sqrt(0.24 / len(record.slips))
+    for slip in record.slips:
+        rows = np.flatnonzero((s.sat == s.satellites.index(slip.satellite)) & (s.signal == s.signals.index(slip.signal)))
+        at = int(np.searchsorted(s.t_s[s.epoch[rows]], slip.t_s))
+        assert record.integer[rows[at]] - record.integer[rows[at - 1]] == slip.cycles != 0
+        assert abs(slip.cycles) <= 4 and s.lli[rows[at]] == slip.flagged
+
+
+def test_after_an_outage_tracking_starts_with_another_integer() -> None:
+    free, _, _ = observed("rest", GnssTable(), 30.0, 0.0)
+    name = free.stream.satellites[0]
+    table = GnssTable(outages=(Outage(start_s=10, end_s=15), Outage(start_s=20, end_s=25, satellites=(name,))))
+    antenna, record, _ = observed("rest", table, 30.0, 0.0)
+    s = antenna.stream
+    t = s.t_s[s.epoch]
+    clock = 0.001  # tags are off by less than this
+    assert not np.any((t >= 10 + clock) & (t < 15 - clock))
+    rows = np.flatnonzero(s.sat == s.satellites.index(name))
+    assert not np.any((t[rows] >= 20 + clock) & (t[rows] < 25 - clock)) and np.any((t > 20) & (t < 25))
+    values = record.integer[rows]
+    starts = np.flatnonzero(s.lli[rows])
+    assert len(starts) == 2 and len(np.unique(values)) == 3
+    assert np.array_equal(np.flatnonzero(np.diff(values)) + 1, starts)
+
+
+def test_error_sources_do_not_disturb_each_other() -> None:
+    plain, a, _ = observed("rest", GnssTable(), 20.0, 1.0)
+    dirty, b, _ = observed("rest", GnssTable(outlier_probability=0.1, slips_per_hour=500.0), 20.0, 1.0)
+    np.testing.assert_allclose(dirty.stream.code_m - b.outlier_m, plain.stream.code_m, atol=1e-6)
+    np.testing.assert_allclose(dirty.stream.phase_cyc - b.integer, plain.stream.phase_cyc - a.integer, atol=1e-6)
+    assert np.array_equal(dirty.stream.doppler_hz, plain.stream.doppler_hz)
+
+
+def test_satellite_errors_are_common_to_receivers() -> None:
+    both = []
+    for name, seed in (("fast", 1), ("rest", 2)):
+        (a, _, _), (b, _, _) = (
+            observed(name, GnssTable(noise=GnssNoiseTable(code_m=1e-9)), 30.0, 1.0, seed, satellite_error_m=x) for x in (0.0, 2.0)
+        )
+        d = b.stream.code_m - a.stream.code_m
+        both.append({(e, b.stream.satellites[i]): v for e, i, v in zip(b.stream.epoch, b.stream.sat, d, strict=True)})
+    common = both[0].keys() & both[1].keys()
+    x, y = (np.array([d[k] for k in common]) for d in both)
+    assert np.std(x) > 0.5 and np.max(np.abs(x - y)) < 1e-3
+
+
+def test_unknown_signals_and_empty_skies_are_errors() -> None:
+    with pytest.raises(InputError, match='signal "G9X"'):
+        observed("rest", GnssTable(signals=("G9X",)), 5.0, 0.0)
+    with pytest.raises(InputError, match="no satellite"):
+        observed("rest", GnssTable(outages=(Outage(start_s=-1, end_s=99),)), 5.0, 0.0)

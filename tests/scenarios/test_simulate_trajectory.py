@@ -1,0 +1,124 @@
+"""Trajectories: smoothness, attitude along the motion, manoeuvres, formation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from factorgraph.attitude import euler_from_matrix, log_so3
+from factorgraph.errors import InputError
+from scenarios.simulate.trajectory import (
+    STANDARD_GRAVITY,
+    Formation,
+    Manoeuvres,
+    OffsetAt,
+    Segment,
+    Static,
+    Trajectory,
+    TrajectoryTable,
+    Waypoint,
+    Waypoints,
+    build,
+)
+
+TURNS = Manoeuvres(
+    kind="manoeuvres",
+    start_n=(10.0, 20.0, 100.0),
+    speed_mps=30.0,
+    heading_deg=350.0,
+    segments=(
+        Segment(duration_s=20.0),
+        Segment(duration_s=15.0, turn_dps=6.0),
+        Segment(duration_s=15.0, accel_mps2=0.4),
+        Segment(duration_s=20.0, bank_deg=-30.0, climb_mps=2.0),
+        Segment(duration_s=20.0),
+    ),
+)
+
+
+def built(**tables: TrajectoryTable) -> dict[str, Trajectory]:
+    return build(dict(tables), 90.0, {name: np.random.default_rng(3) for name in tables})
+
+
+def test_derivatives_are_continuous_and_agree_with_the_motion() -> None:
+    paths = built(a=TURNS, b=Formation(kind="formation", leader="a", offset_m=(20.0, -30.0, 5.0), sway_m=2.0))
+    t, h = np.arange(1.0, 89.0, 0.05), 1e-4
+    for path in paths.values():
+        before, here, after = path.at(t - h), path.at(t), path.at(t + h)
+        np.testing.assert_allclose((after.r_n - before.r_n) / (2 * h), here.v_n, atol=1e-6)
+        rate = log_so3(np.swapaxes(before.C_nb, 1, 2) @ after.C_nb) / (2 * h)
+        np.testing.assert_allclose(rate, here.w_nb_b, atol=1e-6)
+        for spline in (path.position, path.euler):
+            for order in range(5):  # splines of degree 5 on simple knots jump in the fifth derivative only
+                step = spline(t + 1e-9, order) - spline(t - 1e-9, order)
+                assert np.max(np.abs(step)) < 1e-5 * (1 + np.max(np.abs(spline(t, order + 1 if order < 4 else 4))))
+
+
+def test_manoeuvres_turn_accelerate_and_climb_as_told() -> None:
+    path = built(a=TURNS)["a"]
+    start, straight, turned, faster, end = (path.at(np.array([t])) for t in (5.0, 15.0, 42.0, 52.0, 85.0))
+    np.testing.assert_allclose(path.at(np.zeros(1)).r_n[0], TURNS.start_n, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(start.v_n), 30.0, atol=1e-6)
+    heading = [float(euler_from_matrix(m.C_nb)[2][0]) for m in (straight, turned)]
+    np.testing.assert_allclose(np.rad2deg(heading[1] - heading[0]) % 360, 90.0, atol=0.1)
+    np.testing.assert_allclose(np.linalg.norm(faster.v_n[:, :2]), 36.0, atol=0.1)
+    np.testing.assert_allclose(end.r_n[0, 2] - straight.r_n[0, 2], 40.0, atol=0.1)
+
+
+def test_coordinated_flight_feels_no_side_force_and_points_along_the_track() -> None:
+    path = built(a=TURNS)["a"]
+    t = np.arange(0.0, 90.0, 0.1)
+    motion = path.at(t)
+    force = path.position(t, 2) + np.array([0.0, 0.0, STANDARD_GRAVITY])
+    sideways = np.einsum("nij,ni->nj", motion.C_nb, force)[:, 0]
+    assert np.max(np.abs(sideways)) < 0.05  # exact where the climb is level
+    pitch, roll, heading = euler_from_matrix(motion.C_nb)
+    np.testing.assert_allclose(np.exp(1j * heading), np.exp(1j * np.arctan2(motion.v_n[:, 0], motion.v_n[:, 1])), atol=1e-4)
+    np.testing.assert_allclose(np.rad2deg(roll[np.searchsorted(t, 60.0)]), -30.0, atol=0.3)
+    np.testing.assert_allclose(np.tan(pitch), motion.v_n[:, 2] / np.hypot(*motion.v_n[:, :2].T), atol=1e-3)
+
+
+def test_a_follower_holds_its_offsets_in_the_track_frame() -> None:
+    offsets = (OffsetAt(t_s=10.0, offset_m=(30.0, -40.0, 5.0)), OffsetAt(t_s=60.0, offset_m=(-20.0, -10.0, 0.0)))
+    paths = built(b=Formation(kind="formation", leader="a", offsets=offsets), a=TURNS)
+    assert list(paths) == ["b", "a"]
+    for t, offset in ((5.0, offsets[0]), (80.0, offsets[1])):
+        leader, follower = paths["a"].at(np.array([t])), paths["b"].at(np.array([t]))
+        psi = paths["a"].euler(t)[2]
+        right, front = np.array([np.cos(psi), -np.sin(psi), 0.0]), np.array([np.sin(psi), np.cos(psi), 0.0])
+        d = (follower.r_n - leader.r_n)[0]
+        np.testing.assert_allclose((d @ right, d @ front, d[2]), offset.offset_m, atol=1e-3)
+
+
+def test_waypoints_are_passed_at_their_times() -> None:
+    points = tuple(
+        Waypoint(t_s=t, r_n=r) for t, r in ((0, (0, 0, 0)), (30, (600, 50, 20)), (60, (900, 700, 20)), (90, (800, 1400, 0)))
+    )
+    path = built(a=Waypoints(kind="waypoints", points=points))["a"]
+    for p in points:
+        np.testing.assert_allclose(path.at(np.array([p.t_s])).r_n[0], p.r_n, atol=1e-6)
+
+
+def test_rest_and_standstill_keep_the_heading() -> None:
+    stop = Manoeuvres(kind="manoeuvres", heading_deg=40.0, segments=(Segment(duration_s=90.0),), attitude="level")
+    paths = built(a=Static(kind="static", r_n=(1.0, 2.0, 3.0), heading_deg=-100.0), b=stop)
+    for name, heading in (("a", -100.0), ("b", 40.0)):
+        motion = paths[name].at(np.array([0.0, 50.0]))
+        np.testing.assert_allclose(np.rad2deg(euler_from_matrix(motion.C_nb)[2]), heading)
+        assert np.max(np.abs(motion.v_n)) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (Formation(kind="formation", leader="z", offset_m=(0, 0, 0)), "cannot follow z: there are a"),
+        (Formation(kind="formation", leader="a", offset_m=(0, 0, 0)), "in a circle"),
+        (Waypoints(kind="waypoints", points=(Waypoint(t_s=0, r_n=(0, 0, 0)), Waypoint(t_s=50, r_n=(9, 9, 9)))), "span 0 to 50 s"),
+        (Waypoints(kind="waypoints", points=tuple(Waypoint(t_s=t, r_n=(t, 0, 0)) for t in (0, 50, 50, 90))), "must increase"),
+        (Manoeuvres(kind="manoeuvres", segments=(Segment(duration_s=9.0),)), "repeat = true"),
+        (Manoeuvres(kind="manoeuvres", speed_mps=5, segments=(Segment(duration_s=90.0, accel_mps2=-1),)), "slow it down"),
+    ],
+)
+def test_impossible_motions_are_explained(table: TrajectoryTable, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        built(a=table)
