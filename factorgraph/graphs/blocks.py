@@ -196,13 +196,13 @@ class PositionBlock(Block):
 
 @dataclass(slots=True)
 class HeightBlock(Block):
-    """Up coordinate of a point: one row per factor."""
+    """Up coordinates of a point: the rows of one state interval share a factor."""
 
     end: Endpoint
     z_m: Array  # (n,)
 
     def keys(self, f: int) -> list[int]:
-        return list(self.end.keys(f))
+        return list(self.end.keys(int(self.rows.factor.start[f])))
 
     def widths(self) -> tuple[int, ...]:
         return self.end.dims
@@ -218,7 +218,7 @@ class HeightBlock(Block):
 
 @dataclass(slots=True)
 class RangeBlock(Block):
-    """Ranges between two points: z = (1 + scale) |a - b| + bias. One row per factor.
+    """Ranges between two points: z = (1 + scale) |a - b| + bias. The rows of one state interval share a factor.
 
     `a` is on a vehicle; `b` on another vehicle or fixed. Bias and scale are one two-element variable `parameter`.
     """
@@ -232,7 +232,8 @@ class RangeBlock(Block):
     value: Array = field(default_factory=lambda: np.zeros(2))  # bias [m], scale [1]
 
     def keys(self, f: int) -> list[int]:
-        own = [*self.a.keys(f), *(self.b.keys(f) if self.b is not None else ())]
+        row = int(self.rows.factor.start[f])
+        own = [*self.a.keys(row), *(self.b.keys(row) if self.b is not None else ())]
         return own if self.parameter is None else [*own, self.parameter]
 
     def widths(self) -> tuple[int, ...]:

@@ -327,8 +327,9 @@ def position_blocks(vehicle: Vehicle, end: VehicleVariables) -> list[Block]:
         ok = _in_grid(h.t_s, end.t_s) & np.isfinite(h.up_m)
         n = int(ok.sum())
         if n:
-            rows = _plain_rows(HEIGHT, h.t_s[ok], h.sigma_m[ok], np.arange(n), f"{vehicle.name}/{h.name}", ["U"], np.zeros(n, np.int64))
-            blocks.append(HeightBlock(rows, end=Endpoint(end, end.query(h.t_s[ok], h.lever_b)), z_m=h.up_m[ok]))
+            query = end.query(h.t_s[ok], h.lever_b)
+            rows = _plain_rows(HEIGHT, h.t_s[ok], h.sigma_m[ok], query.k, f"{vehicle.name}/{h.name}", ["U"], np.zeros(n, np.int64))
+            blocks.append(HeightBlock(rows, end=Endpoint(end, query), z_m=h.up_m[ok]))
     return blocks
 
 
@@ -352,17 +353,18 @@ def range_blocks(model: RangeModel, ends: dict[str, VehicleVariables], first_par
         va, vb = str(name).split("\n")
         t = stream.t_s[rows]
         labels, index = np.unique([f"{tags[i].name}-{tags[j].name}" for i, j in zip(a[rows], b[rows], strict=True)], return_inverse=True)
-        table = _plain_rows(
-            RANGE, t, stream.sigma_m[rows], np.arange(len(rows)), f"{stream.name} {va}-{vb or 'anchors'}", [str(s) for s in labels], index
-        )
+        query = ends[va].query(t, lever[a[rows]])
         other = Endpoint(ends[vb], ends[vb].query(t, lever[b[rows]])) if vb else None
+        interval = query.k if other is None else query.k * len(grid) + other.query.k
+        source = f"{stream.name} {va}-{vb or 'anchors'}"
+        table = _plain_rows(RANGE, t, stream.sigma_m[rows], interval, source, [str(s) for s in labels], index)
         parameter = None
         if estimated:
             parameter = int(gtsam.symbol("s", first_parameter + (len(blocks) if model.per_pair else 0)))
         blocks.append(
             RangeBlock(
                 table,
-                a=Endpoint(ends[va], ends[va].query(t, lever[a[rows]])),
+                a=Endpoint(ends[va], query),
                 b=other,
                 anchor_n=None if other is not None else anchor[b[rows]],
                 z_m=stream.range_m[rows],

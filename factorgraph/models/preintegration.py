@@ -41,22 +41,30 @@ class Increments:
     w_b: Array  # (n, 3) angular rate at the end, bias not removed
 
 
-@njit(cache=True)
-def _skew(v):  # type: ignore[no-untyped-def]
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+@njit(cache=True, inline="always")
+def _mul(A, B, C):  # type: ignore[no-untyped-def]
+    """C = A B for 3 x 3, C distinct from both."""
+    for i in range(3):
+        for j in range(3):
+            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
 
 
-@njit(cache=True)
-def _exp_and_right_jacobian(phi):  # type: ignore[no-untyped-def]
-    a2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
-    S = _skew(phi)
-    S2 = S @ S
+@njit(cache=True, inline="always")
+def _polynomial(v, a, b, c, C):  # type: ignore[no-untyped-def]
+    """C = a I + b [v x] + c [v x]^2."""
+    x, y, z = v[0], v[1], v[2]
+    C[0, 0], C[0, 1], C[0, 2] = a - c * (y * y + z * z), c * x * y - b * z, c * x * z + b * y
+    C[1, 0], C[1, 1], C[1, 2] = c * x * y + b * z, a - c * (x * x + z * z), c * y * z - b * x
+    C[2, 0], C[2, 1], C[2, 2] = c * x * z - b * y, c * y * z + b * x, a - c * (x * x + y * y)
+
+
+@njit(cache=True, inline="always")
+def _rotation_coefficients(a2):  # type: ignore[no-untyped-def]
+    """sin a / a, (1 - cos a) / a^2, (a - sin a) / a^3."""
     if a2 < 1e-8:
-        s, c, d = 1 - a2 / 6, 0.5 - a2 / 24, 1.0 / 6 - a2 / 120
-    else:
-        a = np.sqrt(a2)
-        s, c, d = np.sin(a) / a, (1 - np.cos(a)) / a2, (a - np.sin(a)) / (a2 * a)
-    return np.eye(3) + s * S + c * S2, np.eye(3) - c * S + d * S2
+        return 1 - a2 / 6, 0.5 - a2 / 24, 1.0 / 6 - a2 / 120
+    a = np.sqrt(a2)
+    return np.sin(a) / a, (1 - np.cos(a)) / a2, (a - np.sin(a)) / (a2 * a)
 
 
 @njit(cache=True)
@@ -65,50 +73,65 @@ def _integrate(edges, f, w, start, stop, bias, dt_out, dR_out, dv_out, dp_out, J
 
     Intervals with equal start and non-decreasing stop continue each other.
     """
-    n = len(start)
     n_samples = len(f)
-    dR, dv, dp = np.eye(3), np.zeros(3), np.zeros(3)
-    JR, Jvg, Jva, Jpg, Jpa = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-    eye = np.eye(3)
+    dR, dv, dp, J = np.eye(3), np.zeros(3), np.zeros(3), np.zeros((5, 3, 3))
+    E, Jr, A1, A2, F = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    M, N, T = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    wk, fk, phi, av, ap = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     t = 0.0
     k = 0
-    for i in range(n):
+    for i in range(len(start)):
         if i == 0 or start[i] != start[i - 1] or stop[i] < stop[i - 1]:
-            dR, dv, dp = np.eye(3), np.zeros(3), np.zeros(3)
-            JR, Jvg, Jva, Jpg, Jpa = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+            dR[:], dv[:], dp[:], J[:] = np.eye(3), 0.0, 0.0, 0.0
             t = start[i]
             k = min(max(np.searchsorted(edges, t, side="right") - 1, 0), n_samples - 1)
         while t < stop[i]:
             end = stop[i]
             if k < n_samples - 1 and edges[k + 1] < end:
                 end = edges[k + 1]
-            dt = end - t
-            if dt > 0:
-                wk, fk = w[k] - bias[i, :3], f[k] - bias[i, 3:]
-                W = _skew(wk)
-                W2 = W @ W
-                E, Jr = _exp_and_right_jacobian(wk * dt)
-                A1 = eye * dt + W * (dt * dt / 2) + W2 * (dt**3 / 6)
-                A2 = eye * (dt * dt / 2) + W * (dt**3 / 6) + W2 * (dt**4 / 24)
-                RA1, RA2 = dR @ A1, dR @ A2
-                av, ap = A1 @ fk, A2 @ fk
-                F = _skew(fk)
-                # d(A1 f)/dw f-terms: -(dt^2/2)[f x], leading order; exact enough for a first-order bias correction
-                Jpg = Jpg + Jvg * dt - dR @ _skew(ap) @ JR + dR @ F * (dt**3 / 6)
-                Jpa = Jpa + Jva * dt - RA2
-                Jvg = Jvg - dR @ _skew(av) @ JR + dR @ F * (dt * dt / 2)
-                Jva = Jva - RA1
-                JR = E.T @ JR - Jr * dt
-                dp = dp + dv * dt + dR @ ap
-                dv = dv + dR @ av
-                dR = dR @ E
+            h = end - t
+            if h > 0:
+                a2 = 0.0
+                for c in range(3):
+                    wk[c], fk[c] = w[k, c] - bias[i, c], f[k, c] - bias[i, 3 + c]
+                    phi[c] = wk[c] * h
+                    a2 += phi[c] * phi[c]
+                s1, s2, s3 = _rotation_coefficients(a2)
+                _polynomial(phi, 1.0, s1, s2, E)
+                _polynomial(phi, 1.0, -s2, s3, Jr)
+                _polynomial(wk, h, h * h / 2, h**3 / 6, A1)
+                _polynomial(wk, h * h / 2, h**3 / 6, h**4 / 24, A2)
+                for c in range(3):
+                    av[c] = A1[c, 0] * fk[0] + A1[c, 1] * fk[1] + A1[c, 2] * fk[2]
+                    ap[c] = A2[c, 0] * fk[0] + A2[c, 1] * fk[1] + A2[c, 2] * fk[2]
+                # positions before velocities, both before the rotation; d(A f)/dw f to leading order is enough here
+                _polynomial(fk, 0.0, 1.0, 0.0, F)
+                _mul(dR, F, T)
+                _polynomial(ap, 0.0, 1.0, 0.0, M)
+                _mul(dR, M, N)
+                _mul(N, J[0], M)
+                J[3] += J[1] * h - M + T * (h**3 / 6)
+                _mul(dR, A2, M)
+                J[4] += J[2] * h - M
+                _polynomial(av, 0.0, 1.0, 0.0, M)
+                _mul(dR, M, N)
+                _mul(N, J[0], M)
+                J[1] += T * (h * h / 2) - M
+                _mul(dR, A1, M)
+                J[2] -= M
+                _mul(E.T, J[0], M)
+                J[0] = M - Jr * h
+                for c in range(3):
+                    dp[c] += dv[c] * h + dR[c, 0] * ap[0] + dR[c, 1] * ap[1] + dR[c, 2] * ap[2]
+                for c in range(3):
+                    dv[c] += dR[c, 0] * av[0] + dR[c, 1] * av[1] + dR[c, 2] * av[2]
+                _mul(dR, E, M)
+                dR[:] = M
             t = end
             if k < n_samples - 1 and t >= edges[k + 1]:
                 k += 1
         dt_out[i] = stop[i] - start[i]
-        dR_out[i], dv_out[i], dp_out[i] = dR, dv, dp
-        J_out[i, 0], J_out[i, 1], J_out[i, 2], J_out[i, 3], J_out[i, 4] = JR, Jvg, Jva, Jpg, Jpa
-        w_out[i] = w[k]
+        dR_out[i], dv_out[i], dp_out[i], J_out[i], w_out[i] = dR, dv, dp, J, w[k]
 
 
 def sample_means(imu: ImuStream) -> tuple[Array, Array, Array]:
@@ -160,12 +183,14 @@ def _log(R):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _tangent_inputs(first, dt_s, dR, dv, w_eff, a_eff, dt):  # type: ignore[no-untyped-def]
+    Jr = np.empty((3, 3))
     for i in range(len(dt_s)):
         R0, v0, th0, t0 = np.eye(3), np.zeros(3), np.zeros(3), 0.0
         if not first[i]:
             R0, v0, th0, t0 = dR[i - 1], dv[i - 1], _log(dR[i - 1]), dt_s[i - 1]
         h = dt_s[i] - t0
-        _, Jr = _exp_and_right_jacobian(th0)
+        _, s2, s3 = _rotation_coefficients(th0[0] ** 2 + th0[1] ** 2 + th0[2] ** 2)
+        _polynomial(th0, 1.0, -s2, s3, Jr)
         dt[i] = h
         w_eff[i] = Jr @ (_log(dR[i]) - th0) / h
         a_eff[i] = R0.T @ (dv[i] - v0) / h

@@ -124,9 +124,7 @@ class _Loader:
         """The report with its files named from the folder they are in."""
         return dataclasses.replace(report, source=report.source.replace(f"{self.located.base}{os.sep}", ""))
 
-    def _problem(
-        self, t0: GpsTime, frame: LocalFrame, vehicles: list[Vehicle], models: list[RangeModel]
-    ) -> NavigationProblem:
+    def _problem(self, t0: GpsTime, frame: LocalFrame, vehicles: list[Vehicle], models: list[RangeModel]) -> NavigationProblem:
         try:
             return NavigationProblem(
                 name=self.located.name,

@@ -59,7 +59,7 @@ class ClockTable(Table):
 
     offset_s: float = Field(default=3e-4, ge=0, le=0.01)  # drawn evenly between plus and minus this
     drift: float = Field(default=1e-7, ge=0)  # standard deviation, seconds per second
-    drift_walk_rts: float = Field(default=1e-9, ge=0)  # density, per sqrt(s)
+    drift_walk_rts: float = Field(default=3e-10, ge=0)  # density, per sqrt(s)
 
 
 class GnssTable(Table):

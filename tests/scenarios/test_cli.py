@@ -66,6 +66,13 @@ def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(place))
 
 
+@pytest.fixture
+def unguarded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Guarded commands run in this process, without handlers of signals: quick, and modules can be patched."""
+    monkeypatch.setattr(guard, "Trace", lambda path: None)
+    monkeypatch.setattr(guard, "run", lambda argv, out, quiet=False: cli.main([*argv, guard.TRACE_OPTION, "unused"]))
+
+
 def relnav(*argv: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Run the command line in a process of its own."""
     return subprocess.run(_command(argv), capture_output=True, text=True, cwd=cwd, env=_env(), timeout=120, check=False)
@@ -136,19 +143,19 @@ def test_a_missing_flight_is_one_line_and_2(command: str, tmp_path: Path) -> Non
     assert not list(tmp_path.iterdir())  # and no empty folder of results
 
 
-def test_an_unknown_key_names_file_key_and_the_nearest(flight: Path) -> None:
+@pytest.mark.usefixtures("unguarded")
+def test_an_unknown_key_names_file_key_and_the_nearest(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = flight / "flight.toml"
     file.write_text(file.read_text(encoding="utf-8").replace("[[vehicle.positions]]", "[[vehicle.position]]"), encoding="utf-8")
-    done = relnav("smooth", flight, cwd=flight)
-    assert done.returncode == guard.FAILED
-    line = one_error_line(done.stderr)
+    assert cli.main(["smooth", str(flight), "--out", str(flight / "out")]) == guard.FAILED
+    line = one_error_line(capsys.readouterr().err)
     assert "flight.toml" in line and "unknown key position" in line and "did you mean positions" in line
 
 
-def test_an_unknown_method_is_told_with_the_known_ones(flight: Path) -> None:
-    done = relnav("smooth", flight, "--method", "grap", cwd=flight)
-    assert done.returncode == guard.FAILED
-    assert "did you mean graph?" in one_error_line(done.stderr)
+@pytest.mark.usefixtures("unguarded")
+def test_an_unknown_method_is_told_with_the_known_ones(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["smooth", str(flight), "--method", "grap", "--out", str(flight / "out")]) == guard.FAILED
+    assert "did you mean graph?" in one_error_line(capsys.readouterr().err)
 
 
 def test_a_file_in_the_way_of_the_results_is_told_before_any_work(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -175,41 +182,43 @@ def test_smooth_writes_results_prints_a_summary_and_their_place(flight: Path) ->
     assert summary["name"] == "walk" and summary["degraded"] is False and len(summary["rows"]) > 5
 
 
-@pytest.mark.usefixtures("plugins")
+@pytest.mark.usefixtures("plugins", "unguarded")
 def test_a_saved_solution_gives_its_report_again(flight: Path) -> None:
-    assert relnav("smooth", flight, "--method", "example", "--no-report", "--out", "one", cwd=flight).returncode == guard.DONE
-    assert not (flight / "one" / "report.html").exists()
-    for name in ("one", "one/solution"):
-        done = relnav("report", name, cwd=flight)
-        assert (done.returncode, done.stderr) == (guard.DONE, "")
-        (flight / "one" / "report.html").unlink()
+    out = flight / "one"
+    assert cli.main(["smooth", str(flight), "--method", "example", "--no-report", "--out", str(out)]) == guard.DONE
+    assert not (out / "report.html").exists()
+    for folder in (out, out / "solution"):
+        assert cli.main(["report", str(folder)]) == guard.DONE
+        (out / "report.html").unlink()
 
 
-def test_a_folder_that_is_not_a_solution_is_not_replaced(flight: Path) -> None:
+@pytest.mark.usefixtures("unguarded")
+def test_a_folder_that_is_not_a_solution_is_not_replaced(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (flight / "solution").mkdir()
-    done = relnav("smooth", flight, "--out", ".", cwd=flight)
-    assert done.returncode == guard.FAILED
-    assert "choose another --out" in one_error_line(done.stderr)
+    assert cli.main(["smooth", str(flight), "--out", str(flight)]) == guard.FAILED
+    assert "choose another --out" in one_error_line(capsys.readouterr().err)
 
 
-@pytest.mark.usefixtures("plugins")
-def test_a_degraded_result_is_written_told_and_1(flight: Path) -> None:
-    done = relnav("smooth", flight, "--method", "degraded", "--out", "out", cwd=flight)
-    assert done.returncode == guard.DEGRADED
-    assert "no position from 3 s to 9 s" in done.stderr and "iteration limit" in done.stderr
-    assert (flight / "out" / "report.html").exists()
+@pytest.mark.usefixtures("plugins", "unguarded")
+def test_a_degraded_result_is_written_told_and_1(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = flight / "out"
+    assert cli.main(["smooth", str(flight), "--method", "degraded", "--out", str(out)]) == guard.DEGRADED
+    err = capsys.readouterr().err
+    assert "no position from 3 s to 9 s" in err and "iteration limit" in err
+    assert (out / "report.html").exists()
 
 
-@pytest.mark.usefixtures("plugins")
-def test_dropped_rows_are_told(flight: Path) -> None:
+@pytest.mark.usefixtures("plugins", "unguarded")
+def test_dropped_rows_are_told(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with (flight / "fixes.csv").open("a", encoding="utf-8") as file:
         file.write("20,abc,1,2\n")
-    done = relnav("smooth", flight, "--method", "example", cwd=flight)
-    assert done.returncode == guard.DONE
-    assert "fixes.csv" in done.stderr and "dropped 1" in done.stderr
+    argv = ["smooth", str(flight), "--method", "example", "--no-report", "--out", str(flight / "out")]
+    assert cli.main(argv) == guard.DONE
+    err = capsys.readouterr().err
+    assert "fixes.csv" in err and "dropped 1" in err
 
 
-@pytest.mark.usefixtures("plugins")
+@pytest.mark.usefixtures("plugins", "unguarded")
 @pytest.mark.parametrize(("failing", "left"), [("writers.write_all", ["solution"]), ("solutions.save", [])])
 def test_a_full_disk_is_one_line_and_what_was_finished_survives(
     failing: str, left: list[str], flight: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -218,10 +227,8 @@ def test_a_full_disk_is_one_line_and_what_was_finished_survives(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
     monkeypatch.setattr(f"scenarios.{failing}", full)
-    monkeypatch.setattr(guard, "Trace", lambda path: None)  # no handlers of signals in this process
-    out = flight.parent / "out"
-    argv = ["smooth", str(flight), "--method", "example", "--out", str(out), guard.TRACE_OPTION, "unused"]
-    assert cli.main(argv) == guard.FAILED
+    out = flight / "out"
+    assert cli.main(["smooth", str(flight), "--method", "example", "--out", str(out)]) == guard.FAILED
     line = one_error_line(capsys.readouterr().err)
     assert os.strerror(errno.ENOSPC) in line
     assert (f"results so far are in {out}" if left else "nothing is written yet") in line
@@ -291,11 +298,12 @@ def test_check_tells_what_a_flight_holds(flight: Path, capsys: pytest.CaptureFix
     assert sensor["samples"] == 20 and sensor["from s"] == 0.0 and sensor["to s"] == 19.0
 
 
+@pytest.mark.usefixtures("unguarded")
 def test_a_simulated_flight_is_one_that_check_reads(tmp_path: Path) -> None:
-    (tmp_path / "one.toml").write_text(SCENARIO, encoding="utf-8")
-    done = relnav("simulate", "one.toml", "sim", "--seed", 3, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (guard.DONE, "")
-    assert relnav("check", "sim", cwd=tmp_path).returncode == guard.DONE
+    scenario, flight = tmp_path / "one.toml", tmp_path / "sim"
+    scenario.write_text(SCENARIO, encoding="utf-8")
+    assert cli.main(["simulate", str(scenario), str(flight), "--seed", "3"]) == guard.DONE
+    assert cli.main(["check", str(flight)]) == guard.DONE
 
 
 def test_a_demo_shows_every_flight_and_a_failure_hides_none(

@@ -79,7 +79,11 @@ def test_data_sheet_units() -> None:
 
 @pytest.mark.parametrize(
     ("axes", "columns"),
-    [("RFU", ((1, 0, 0), (0, 1, 0), (0, 0, 1))), ("FRD", ((0, 1, 0), (1, 0, 0), (0, 0, -1))), ("FLU", ((0, 1, 0), (-1, 0, 0), (0, 0, 1)))],
+    [
+        ("RFU", ((1, 0, 0), (0, 1, 0), (0, 0, 1))),
+        ("FRD", ((0, 1, 0), (1, 0, 0), (0, 0, -1))),
+        ("FLU", ((0, 1, 0), (-1, 0, 0), (0, 0, 1))),
+    ],
 )
 def test_axes(axes: str, columns: tuple[tuple[int, int, int], ...]) -> None:
     np.testing.assert_array_equal(axes_matrix(axes), np.column_stack(columns))

@@ -179,10 +179,10 @@ def test_nmea_without_a_date(tmp_path: Path) -> None:
 
 
 POS_LLH = """% program   : x
-%  GPST                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio
-2021/09/22 06:30:00.250   35.000000000  139.000000000    50.0000   1  12   0.0300   0.0200   0.0500   0.0100  -0.0100   0.0200   0.00    6.6
+%  GPST  latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m) age(s) ratio
+2021/09/22 06:30:00.250   35.000000000  139.000000000  50.0000 1 12 0.0300 0.0200 0.0500 0.0100 -0.0100 0.0200 0.00 6.6
 2021/09/22 06:30:xx       35.0
-2021/09/22 06:30:01.250   35.000010000  139.000000000    50.0000   2  11   0.3000   0.2000   0.5000   0.0000   0.0000   0.0000   0.00    1.1
+2021/09/22 06:30:01.250   35.000010000  139.000000000  50.0000 2 11 0.3000 0.2000 0.5000 0.0000  0.0000 0.0000 0.00 1.1
 """
 
 
@@ -200,9 +200,8 @@ def test_pos_geodetic(tmp_path: Path) -> None:
 
 def test_pos_in_utc_with_week_and_seconds_and_baselines(tmp_path: Path) -> None:
     path = tmp_path / "a.pos"
-    path.write_text(
-        "% ref pos   : 35.0 139.0 50.0\n%  UTC   e-baseline(m) n-baseline(m) u-baseline(m) Q ns\n2176 282582.000 1.0 2.0 3.0 1 9\n"
-    )
+    titles = "%  UTC   e-baseline(m) n-baseline(m) u-baseline(m) Q ns"
+    path.write_text(f"% ref pos   : 35.0 139.0 50.0\n{titles}\n2176 282582.000 1.0 2.0 3.0 1 9\n")
     pos = read_pos(path)
     assert pos.kind == "enu" and pos.times.since(GpsTime(2176, 282_600.0)) == pytest.approx([0.0])
     base = ecef_from_geodetic(np.deg2rad(35.0), np.deg2rad(139.0), 50.0)

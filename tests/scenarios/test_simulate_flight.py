@@ -167,7 +167,7 @@ def test_wrong_descriptions_name_the_key(old: str, new: str, message: str) -> No
 
 
 def test_unknown_scenarios_name_the_nearest(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no scenario or file two-uavs; did you mean two-uav?"):
+    with pytest.raises(InputError, match=r"no scenario or file two-uavs; did you mean two-uav\?"):
         load_scenario("two-uavs")
     with pytest.raises(InputError, match=os.strerror(21)):
         load_scenario(tmp_path)

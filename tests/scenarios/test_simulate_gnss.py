@@ -12,9 +12,9 @@ from factorgraph.problem import Antenna, GnssNoise
 from factorgraph.types import Array
 from scenarios.flights.navigation import builtin_constellation
 from scenarios.flights.schema import GnssNoiseTable, Origin
-from scenarios.simulate.gnss import EnvironmentTable, GnssRecord, GnssTable, Outage, Sky, simulate
+from scenarios.simulate.gnss import ClockTable, EnvironmentTable, GnssRecord, GnssTable, Outage, Sky, simulate
 from scenarios.simulate.streams import Streams
-from scenarios.simulate.trajectory import Formation, Manoeuvres, Segment, Static, Trajectory, build
+from scenarios.simulate.trajectory import Formation, Manoeuvres, Segment, Static, Trajectory, TrajectoryTable, build
 
 T0 = GpsTime(2317, 300_000.0)
 ORIGIN = Origin(lat_deg=47.0, lon_deg=11.0, h_m=500.0)
@@ -30,7 +30,7 @@ def paths(duration_s: float) -> dict[str, Trajectory]:
     fast = Manoeuvres(
         kind="manoeuvres", start_n=(0.0, 0.0, 900.0), speed_mps=110.0, segments=(Segment(duration_s=duration_s, turn_dps=2.0),)
     )
-    tables = {
+    tables: dict[str, TrajectoryTable] = {
         "fast": fast,
         "near": Formation(kind="formation", leader="fast", offset_m=(40.0, -60.0, 10.0), sway_m=1.0),
         "rest": Static(kind="static"),
@@ -64,8 +64,9 @@ def test_without_noise_double_differences_are_geometry(signals: tuple[str, ...])
         antenna, record, path = observed(name, table, 40.0, 0.0, satellite_error_m=1.0)
         code, phase = phase_without_integers(antenna, record, path)
         clock_m = record.clock_s[antenna.stream.epoch] * 299_792_458.0
-        assert np.max(np.abs(code - clock_m)) < 1e-5
-        assert np.max(np.abs(phase - clock_m)) < 1e-5
+        # the estimators' model leaves 1e-4 m in single ranges
+        assert np.max(np.abs(code - clock_m)) < 2e-4
+        assert np.max(np.abs(phase - clock_m)) < 2e-4
         s = antenna.stream
         rows = zip(s.epoch, s.sat, s.signal, strict=True)
         residuals[name] = {(e, s.satellites[i], s.signals[j]): phase[k] for k, (e, i, j) in enumerate(rows)}
@@ -77,12 +78,14 @@ def test_without_noise_double_differences_are_geometry(signals: tuple[str, ...])
 
 
 def test_doppler_is_the_rate_of_the_phase() -> None:
-    antenna, record, _ = observed("rest", GnssTable(rate_hz=10.0, lever_b=LEVER), 10.0, 0.0)
+    """Without the atmosphere, whose change (below 1 mm/s) the Doppler leaves out."""
+    table = GnssTable(rate_hz=10.0, lever_b=LEVER, clock=ClockTable(drift=1e-6, drift_walk_rts=0.0))
+    antenna, record, _ = observed("rest", table, 10.0, 0.0, troposphere=0.0, ionosphere=0.0)
     s = antenna.stream
     for i in range(len(s.satellites)):
         rows = np.flatnonzero(s.sat == i)
         rate = (s.phase_cyc[rows[2:]] - s.phase_cyc[rows[:-2]]) / 0.2
-        np.testing.assert_allclose(-s.doppler_hz[rows[1:-1]], rate, atol=0.02)
+        np.testing.assert_allclose(-s.doppler_hz[rows[1:-1]], rate, atol=1e-5)
     assert np.ptp(record.clock_s) > 0
 
 
