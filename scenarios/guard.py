@@ -42,9 +42,9 @@ class Trace:
     def __init__(self, path: Path) -> None:
         self._file = path.open("w", encoding="utf-8")
         faulthandler.enable(self._file)
-        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-            if hasattr(signal, name):
-                signal.signal(getattr(signal, name), _interrupt_once)
+        signal.signal(signal.SIGINT, _interrupt_once)
+        for number in _requests_to_end():
+            signal.signal(number, _interrupt_once)
 
     def stage(self, name: str) -> None:
         """Note what begins now."""
@@ -54,10 +54,15 @@ class Trace:
 
 def _interrupt_once(signum: int, frame: FrameType | None) -> NoReturn:
     # one interrupt: what follows is saving and cleaning up, which must not be interrupted again
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    for number in (signal.SIGINT, *_requests_to_end()):
+        signal.signal(number, signal.SIG_IGN)
     raise KeyboardInterrupt
+
+
+def _requests_to_end() -> list[signal.Signals]:
+    """SIGTERM and SIGHUP, where they exist and are not ignored on purpose (nohup)."""
+    found = (getattr(signal, name, None) for name in ("SIGTERM", "SIGHUP"))
+    return [number for number in found if number is not None and signal.getsignal(number) is not signal.SIG_IGN]
 
 
 def run(argv: Sequence[str], out: Path, quiet: bool = False) -> int:
@@ -93,10 +98,7 @@ def _start(argv: list[str], quiet: bool) -> subprocess.Popen[bytes]:
 
 def _wait(child: subprocess.Popen[bytes]) -> tuple[int, bool]:
     """The child's exit code, and whether a second Ctrl-C killed it."""
-    restore = {}
-    for name in ("SIGTERM", "SIGHUP"):
-        if hasattr(signal, name):
-            restore[name] = signal.signal(getattr(signal, name), signal.default_int_handler)
+    restore = {number: signal.signal(number, signal.default_int_handler) for number in _requests_to_end()}
     interrupts = 0
     try:
         while True:
@@ -108,8 +110,8 @@ def _wait(child: subprocess.Popen[bytes]) -> tuple[int, bool]:
             except subprocess.TimeoutExpired:
                 _interrupt(child, False)
     finally:
-        for name, handler in restore.items():
-            signal.signal(getattr(signal, name), handler)
+        for number, handler in restore.items():
+            signal.signal(number, handler)
 
 
 def _interrupt(child: subprocess.Popen[bytes], at_once: bool) -> None:

@@ -10,6 +10,7 @@ with robust weights w_i per row, never per factor.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -131,19 +132,27 @@ class Block:
     def columns(self, f: int) -> list[Array]:
         """Whitened Jacobians of factor f, one per key."""
         i, j = self.slices(f)
-        edges = np.cumsum((0, *self.widths()))
-        return [self.Jw[i:j, a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        return [self.Jw[i:j, a:b] for a, b in self.edges()]
+
+    def edges(self) -> list[tuple[int, int]]:
+        """Column ranges of the keys."""
+        ends = np.cumsum((0, *self.widths())).tolist()
+        return list(itertools.pairwise(ends))
 
     def add_factors(self, graph: gtsam.NonlinearFactorGraph) -> None:
+        edges = self.edges()
         for f in range(len(self.rows.factor.start)):
             i, j = self.slices(f)
-            graph.add(self._carrier(f, i, j))
+            graph.add(self._carrier(f, i, j, edges))
 
-    def _carrier(self, f: int, i: int, j: int) -> gtsam.CustomFactor:
+    def _carrier(self, f: int, i: int, j: int, edges: list[tuple[int, int]]) -> gtsam.CustomFactor:
+        """A factor that hands out rows i:j of what `whiten` computed."""
+
         def error(_factor: gtsam.CustomFactor, _values: gtsam.Values, jacobians: list[Array] | None) -> Array:
             if jacobians is not None:
-                for slot, column in enumerate(self.columns(f)):
-                    jacobians[slot] = column
+                Jw = self.Jw[i:j]
+                for slot, (a, b) in enumerate(edges):
+                    jacobians[slot] = Jw[:, a:b]
             return self.e[i:j]
 
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(j - i), self.keys(f), error)
@@ -306,6 +315,9 @@ class IonosphereBlock(Block):
     def columns(self, f: int) -> list[Array]:
         return Block.columns(self, f)[: len(self.keys(f))]
 
+    def _carrier(self, f: int, i: int, j: int, edges: list[tuple[int, int]]) -> gtsam.CustomFactor:
+        return Block._carrier(self, f, i, j, edges[: 1 if self.previous[f] < 0 else 2])
+
 
 @dataclass(slots=True)
 class JointBlock(Block):
@@ -381,6 +393,18 @@ class GnssBlock(Block):
     def add_factors(self, graph: gtsam.NonlinearFactorGraph) -> None:
         self.scalar_cache.clear()
         Block.add_factors(self, graph)
+
+    def _carrier(self, f: int, i: int, j: int, edges: list[tuple[int, int]]) -> gtsam.CustomFactor:
+        if not self.scalars(f)[0]:
+            return Block._carrier(self, f, i, j, edges)
+
+        def error(_factor: gtsam.CustomFactor, _values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+            if jacobians is not None:
+                for slot, column in enumerate(self.columns(f)):
+                    jacobians[slot] = column
+            return self.e[i:j]
+
+        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(j - i), self.keys(f), error)
 
     def widths(self) -> tuple[int, ...]:
         return tuple(d for end in self._ends() for d in end.dims)

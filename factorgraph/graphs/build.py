@@ -478,7 +478,7 @@ def build(
     for pair in problem.wanted_pairs:
         both = [ends[pair.reference], ends[pair.rover]]
         if all(end.mode != "fixed" for end in both):
-            others.append(joint_block(both[0], both[1]))
+            graph.joints.append(joint_block(both[0], both[1]))
     graph.blocks = [*graph.gnss, *absolute, *graph.ranges, *others]
     progress(0.5)
     native_factors(graph)

@@ -25,7 +25,7 @@ DIMENSION = {"x": 6, "b": 6, "p": 3, "v": 3, "a": 1, "i": 1, "s": 2}  # of a var
 
 @dataclass(slots=True)
 class Result:
-    """How an optimisation ended."""
+    """How an optimisation ended; the Bayes net is that of the last linearisation, one small step before the end."""
 
     status: Status
     costs: list[float]
@@ -41,6 +41,7 @@ class Graph:
     native: gtsam.NonlinearFactorGraph
     gnss: list[GnssBlock] = field(default_factory=list)
     ranges: list[RangeBlock] = field(default_factory=list)
+    joints: list[Block] = field(default_factory=list)  # only for covariances: what is to share a clique
     values: gtsam.Values = field(default_factory=gtsam.Values)
     graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     last: list[int] = field(default_factory=list)
@@ -92,6 +93,17 @@ class Graph:
         for block in self.blocks:
             block.whiten()
         return self.graph.linearize(self.values)
+
+    def covariance_net(self) -> gtsam.GaussianBayesNet | None:
+        """The elimination at the current values, with the variables of `joints` kept together."""
+        linear = self.linearize()
+        extra = gtsam.NonlinearFactorGraph()
+        for block in self.joints:
+            block.predict()
+            block.whiten()
+            block.add_factors(extra)
+        linear.push_back(extra.linearize(self.values))
+        return eliminate(linear, self.ordering(linear))
 
     def ordering(self, linear: gtsam.GaussianFactorGraph) -> gtsam.Ordering:
         if self.last:
@@ -151,16 +163,12 @@ def optimise(
             lam = LAMBDA_START if lam == 0 else lam * 10
             if lam > LAMBDA_MAX:
                 status = Status.SINGULAR if net is None else Status.STALLED
-                return Result(status, costs, _final_net(graph))
+                return Result(status, costs, net)
         lam = 0.0 if lam <= LAMBDA_START else lam / 10
         decrease, cost = cost - new, new
         costs.append(cost)
         progress(iteration + 1, cost)
         if lam == 0.0 and decrease < tolerance * cost + 1e-6:
-            return Result(Status.CONVERGED, costs, _final_net(graph))
-    return Result(Status.MAX_ITERATIONS, costs, _final_net(graph))
+            return Result(Status.CONVERGED, costs, net)
+    return Result(Status.MAX_ITERATIONS, costs, net)
 
-
-def _final_net(graph: Graph) -> gtsam.GaussianBayesNet | None:
-    linear = graph.linearize()
-    return eliminate(linear, graph.ordering(linear))

@@ -6,6 +6,7 @@ import dataclasses
 import platform
 from importlib.metadata import PackageNotFoundError, version
 
+import gtsam
 import numpy as np
 
 from factorgraph import geodesy
@@ -40,7 +41,8 @@ FIXED_DIFFERENCES = 4  # double differences with integers that make an epoch fix
 def make_solution(problem: NavigationProblem, built: Built, result: Result, ratio: float, spent: dict[str, float], notes: list[str]) -> Solution:
     """Collect everything known after the optimisation."""
     graph = built.graph
-    cov = JointCovariance(result.bayes_net) if result.bayes_net is not None else None
+    net = graph.covariance_net()
+    cov = JointCovariance(net) if net is not None else None
     vehicles = tuple(_vehicle(v, cov) for v in graph.vehicles)
     ends = {v.name: v for v in graph.vehicles}
     links = {(d.link.reference, d.link.rover): d for d in built.links}
@@ -54,7 +56,7 @@ def make_solution(problem: NavigationProblem, built: Built, result: Result, rati
         frame=problem.frame,
         vehicles=vehicles,
         pairs=pairs,
-        ambiguities=_ambiguities(graph, built.links, result),
+        ambiguities=_ambiguities(graph, built.links, net),
         residuals=residuals,
         diagnostics=Diagnostics(
             status=result.status,
@@ -64,7 +66,7 @@ def make_solution(problem: NavigationProblem, built: Built, result: Result, rati
             nis_t_s=nis_t,
             nis=nis,
             nis_dof=dof,
-            warnings=tuple(_warnings(problem, built, result, pairs)),
+            warnings=tuple(_warnings(problem, built, result.status, net is None, pairs)),
             notes=(*notes, *_slip_notes(built.links)),
             parameters=_parameters(graph, cov),
         ),
@@ -150,15 +152,8 @@ def _pair(
 ) -> PairSolution:
     a, b = ends[pair.reference], ends[pair.rover]
     K = len(a.t_s)
-    lat, lon, _ = geodesy.geodetic_from_ecef(problem.frame.to_ecef(a.r))
-    C = geodesy.C_en(lat, lon) @ problem.frame.C_en.T  # n -> ENU at the reference
-    P = np.full((K, 6, 6), np.nan)
-    if cov is not None:
-        for k in range(K):
-            P[k] = _relative_covariance(a, b, k, cov)
-        CC = np.zeros((K, 6, 6))
-        CC[:, :3, :3], CC[:, 3:, 3:] = C, C
-        P = CC @ P @ np.swapaxes(CC, 1, 2)
+    C = _enu_at(problem, a)
+    P = pair_covariance(problem, a, b, cov) if cov is not None else np.full((K, 6, 6), np.nan)
     fix, n_sat, ratios = _fix_status(link, b, K, ratio)
     truth, truth_v = _pair_truth(a, b, C)
     return PairSolution(
@@ -174,6 +169,21 @@ def _pair(
         truth,
         truth_v,
     )
+
+
+def _enu_at(problem: NavigationProblem, v: VehicleVariables) -> Array:
+    """Rotations (K, 3, 3) from n to east-north-up at the vehicle."""
+    lat, lon, _ = geodesy.geodetic_from_ecef(problem.frame.to_ecef(v.r))
+    return geodesy.C_en(lat, lon) @ problem.frame.C_en.T
+
+
+def pair_covariance(problem: NavigationProblem, a: VehicleVariables, b: VehicleVariables, cov: JointCovariance) -> Array:
+    """Covariance (K, 6, 6) of b relative to a, position and velocity, east-north-up at a."""
+    C = _enu_at(problem, a)
+    CC = np.zeros((len(C), 6, 6))
+    CC[:, :3, :3], CC[:, 3:, 3:] = C, C
+    P = np.array([_relative_covariance(a, b, k, cov) for k in range(len(C))])
+    return np.asarray(CC @ P @ np.swapaxes(CC, 1, 2))
 
 
 def _relative_covariance(a: VehicleVariables, b: VehicleVariables, k: int, cov: JointCovariance) -> Array:
@@ -238,14 +248,14 @@ def _fix_status(link: GnssLink | None, rover: VehicleVariables, K: int, ratio: f
     return fix, n_sat, ratios
 
 
-def _ambiguities(graph: Graph, links: list[GnssLink], result: Result) -> AmbiguityTable:
+def _ambiguities(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNet | None) -> AmbiguityTable:
     rows: list[tuple[str, str, str, float, float, float, float, float, str]] = []
     for data in links:
         block = data.block
         free = [i for i in range(len(block.amb_key)) if block.amb_key[i] != 0 and graph.values.exists(int(block.amb_key[i]))]
         sigma = np.full(len(block.amb_key), np.nan)
-        if free and result.bayes_net is not None:
-            sigma[free] = np.sqrt(np.diag(tail_covariance(result.bayes_net, [int(block.amb_key[i]) for i in free])))
+        if free and net is not None:
+            sigma[free] = np.sqrt(np.diag(tail_covariance(net, [int(block.amb_key[i]) for i in free])))
         for i, state in enumerate(data.state):
             integer = float(block.amb_value[i]) if state in ("fixed", "datum") else np.nan
             rows.append(
@@ -343,11 +353,11 @@ def _parameters(graph: Graph, cov: JointCovariance | None) -> dict[str, tuple[fl
     return out
 
 
-def _warnings(problem: NavigationProblem, built: Built, result: Result, pairs: tuple[PairSolution, ...]) -> list[str]:
+def _warnings(problem: NavigationProblem, built: Built, status: Status, singular: bool, pairs: tuple[PairSolution, ...]) -> list[str]:
     out = []
-    if result.status is not Status.CONVERGED:
-        out.append(f"the optimisation stopped early: {result.status.value}")
-    if result.bayes_net is None:
+    if status is not Status.CONVERGED:
+        out.append(f"the optimisation stopped early: {status.value}")
+    if singular:
         out.append("no covariance: the normal matrix is singular")
     for data in built.links:
         name = f"{data.link.reference}-{data.link.rover}"

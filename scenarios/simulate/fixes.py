@@ -10,14 +10,14 @@ from factorgraph.measurements import HeightStream, PositionStream
 from factorgraph.problem import Vec3
 from factorgraph.types import Array
 from scenarios.flights.schema import Table
-from scenarios.simulate.streams import Streams
+from scenarios.simulate.streams import Name, Streams
 from scenarios.simulate.trajectory import Trajectory
 
 
 class PositionTable(Table):
     """Position fixes of an antenna."""
 
-    name: str = "position"
+    name: Name = "position"
     rate_hz: PositiveFloat = 1.0
     offset_s: float = Field(default=0.0, ge=0)
     sigma_m: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (1.5, 1.5, 3.0)
@@ -27,7 +27,7 @@ class PositionTable(Table):
 class HeightTable(Table):
     """Heights of a point of the body above the local origin."""
 
-    name: str = "height"
+    name: Name = "height"
     rate_hz: PositiveFloat = 10.0
     offset_s: float = Field(default=0.0, ge=0)
     sigma_m: PositiveFloat = 0.5

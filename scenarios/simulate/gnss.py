@@ -68,7 +68,7 @@ class GnssTable(Table):
     rate_hz: PositiveFloat = 1.0
     offset_s: float = Field(default=0.0, ge=0)
     lever_b: Vec3 = (0.0, 0.0, 0.0)
-    signals: tuple[str, ...] = ("G1C", "E1C")
+    signals: tuple[str, ...] = Field(default=("G1C", "E1C"), min_length=1)
     noise: GnssNoiseTable = GnssNoiseTable()  # simulated, and what the estimator is told
     mask_deg: float = Field(default=5.0, ge=3, lt=90)
     clock: ClockTable = ClockTable()
@@ -170,46 +170,27 @@ def simulate(
     """
     check_signals(table.signals)
     table = table.model_copy(update={"signals": tuple(sorted(set(table.signals)))})
-    noise = table.noise.noise
     t_tag = epochs(table.rate_hz, table.offset_s, sky.duration_s)
     clock_s, drift = _clock(table.clock, t_tag, streams("clock"))
     t = t_tag - clock_s
     r_n, v_n = trajectory.at(t).point(table.lever_b)
-    r, v = sky.frame.to_ecef(r_n), sky.frame.rotate_to_ecef(v_n)
+    r = sky.frame.to_ecef(r_n)
     names = _in_view(table, sky, t, r)
-    geometry = _geometry(sky, names, t, r, v)
+    geometry = _geometry(sky, names, t, r, sky.frame.rotate_to_ecef(v_n))
     tracked = (geometry.el >= np.deg2rad(table.mask_deg)) & (geometry.record >= 0) & ~_outages(table.outages, names, t)
-    belongs = np.array([[signal[0] == name[0] for signal in table.signals] for name in names])
-    e, s, k = np.nonzero(tracked[:, :, None] & belongs)
-    if not len(e):
-        signals = ", ".join(table.signals)
-        raise InputError(f"no satellite with {signals} is above {table.mask_deg:g} deg: check signals, mask and outages")
-
-    def drawn(source: str, draw: Callable[[np.random.Generator, int], Array]) -> Array:
-        """Per row, from a stream of each satellite and signal that covers every epoch."""
-        out = np.zeros((len(t), *belongs.shape))
-        for i, j in np.argwhere(belongs):
-            out[:, i, j] = draw(streams(f"{source}/{names[i]}/{table.signals[j]}"), len(t))
-        return out[e, s, k]
-
-    def normal(rng: np.random.Generator, n: int) -> Array:
-        return rng.normal(0.0, 1.0, n)
-
+    rows = _rows(table, names, tracked, streams)
+    integer, lli, slips = _integers(table, names, tracked, t_tag, streams)
+    e, s, k = rows.epoch, rows.sat, rows.signal
     lam = np.array([[wavelength_m(j, sky.navigation.glonass_channels.get(i)) for j in table.signals] for i in names])[s, k]
     el = geometry.el[e, s]
     scale = noise_scale * elevation_scale(el)
-    integer, lli, slips = _integers(table, names, tracked, t_tag, streams)
-    outlier = noise_scale * drawn("outlier", lambda rng, n: _outliers(table, rng, n))
-    step = 1 / (table.rate_hz * table.multipath_s)
-    multipath = scale * table.multipath_m * drawn("multipath", lambda rng, n: _correlated(normal(rng, n), step))
+    outlier = noise_scale * rows.drawn("outlier", lambda rng, n: _outliers(table, rng, n))
     sat_clock = geometry.clock_m[e, s] - sky.navigation.group_delay_m(geometry.record[e, s], table.signals, k)
     common = geometry.rho[e, s] + C_MPS * clock_s[e] - sat_clock + geometry.tropo[e, s]
     common += noise_scale * sky.satellite_error_m(names, s, t[e])
     iono = geometry.iono_l1[e, s] * (lam / WAVELENGTH_L1_M) ** 2
     rate = geometry.rho_dot[e, s] * (1 - drift[e]) + C_MPS * drift[e] - geometry.clock_mps[e, s]
-    code = common + iono + scale * noise.code_m * drawn("code", normal) + multipath + outlier
-    phase = common - iono + scale * noise.phase_m * drawn("phase", normal)
-    rate = rate + scale * noise.doppler_mps * drawn("doppler", normal)
+    noise = _noise(table, rows, scale)
     used, sat = np.unique(s, return_inverse=True)
     used_signals, signal = np.unique(k, return_inverse=True)
     stream = GnssStream(
@@ -220,10 +201,10 @@ def simulate(
         satellites=tuple(names[i] for i in used),
         signals=tuple(table.signals[j] for j in used_signals),
         wavelength_m=lam,
-        code_m=code,
-        phase_cyc=phase / lam + integer[e, s, k],
-        doppler_hz=-rate / lam,
-        cn0_dbhz=34.0 + 16.0 * np.sin(el) + noise_scale * 0.7 * drawn("cn0", normal),
+        code_m=common + iono + noise.code_m + outlier,
+        phase_cyc=(common - iono + noise.phase_m) / lam + integer[e, s, k],
+        doppler_hz=-(rate + noise.rate_mps) / lam,
+        cn0_dbhz=34.0 + 16.0 * np.sin(el) + noise_scale * 0.7 * rows.drawn("cn0", _white),
         lli=lli[e, s],
         sat_pos_ecef=geometry.pos[e, s],
         sat_vel_ecef=geometry.vel[e, s],
@@ -234,6 +215,60 @@ def simulate(
     )
     record = GnssRecord(integer[e, s, k], outlier, geometry.rho[e, s], el, slips, clock_s, drift)
     return Antenna(stream, table.lever_b, told(table)), record
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """Rows in order of epoch, satellite and signal, and random numbers for them."""
+
+    epoch: IntArray  # (n,)
+    sat: IntArray
+    signal: IntArray
+    n_epochs: int
+    channels: tuple[tuple[int, int, str], ...]  # satellite, signal, name
+    streams: Streams
+
+    def drawn(self, source: str, draw: Callable[[np.random.Generator, int], Array]) -> Array:
+        """Numbers (n,) from a stream of each satellite and signal that covers every epoch, seen or not."""
+        out = np.zeros(len(self.epoch))
+        for i, j, name in self.channels:
+            mine = (self.sat == i) & (self.signal == j)
+            out[mine] = draw(self.streams(f"{source}/{name}"), self.n_epochs)[self.epoch[mine]]
+        return out
+
+
+def _rows(table: GnssTable, names: tuple[str, ...], tracked: BoolArray, streams: Streams) -> _Rows:
+    belongs = np.array([[signal[0] == name[0] for signal in table.signals] for name in names])
+    e, s, k = np.nonzero(tracked[:, :, None] & belongs)
+    if not len(e):
+        signals = ", ".join(table.signals)
+        raise InputError(f"no satellite with {signals} is ever tracked above {table.mask_deg:g} deg: check mask and outages")
+    channels = tuple((int(i), int(j), f"{names[i]}/{table.signals[j]}") for i, j in np.argwhere(belongs))
+    return _Rows(e, s, k, len(tracked), channels, streams)
+
+
+def _white(rng: np.random.Generator, n: int) -> Array:
+    return rng.normal(0.0, 1.0, n)
+
+
+@dataclass(frozen=True, slots=True)
+class _Noise:
+    """Noise of every row (n,); of the code with multipath."""
+
+    code_m: Array
+    phase_m: Array
+    rate_mps: Array
+
+
+def _noise(table: GnssTable, rows: _Rows, scale: Array) -> _Noise:
+    noise = table.noise.noise
+    step = 1 / (table.rate_hz * table.multipath_s)
+    multipath = table.multipath_m * rows.drawn("multipath", lambda rng, n: _correlated(_white(rng, n), step))
+    return _Noise(
+        scale * (noise.code_m * rows.drawn("code", _white) + multipath),
+        scale * noise.phase_m * rows.drawn("phase", _white),
+        scale * noise.doppler_mps * rows.drawn("doppler", _white),
+    )
 
 
 def told(table: GnssTable) -> GnssNoise:
@@ -274,15 +309,17 @@ def _outages(outages: tuple[Outage, ...], names: tuple[str, ...], t_s: Array) ->
 
 
 def _in_view(table: GnssTable, sky: Sky, t_s: Array, r_ecef: Array) -> tuple[str, ...]:
-    """Satellites with a wanted signal that come above the mask."""
+    """Satellites with a wanted signal that may come above the mask, at least one."""
     systems = {signal[0] for signal in table.signals}
     names = tuple(name for name in sky.navigation.satellites if name[0] in systems)
+    if not names:
+        raise InputError(f"no satellites of {', '.join(sorted(systems))} to simulate with; there are G, E, C and J")
     at = np.unique(np.append(np.arange(0, len(t_s), max(1, int(SEARCH_S * table.rate_hz))), len(t_s) - 1))
     i, sat = np.repeat(at, len(names)), np.tile(np.arange(len(names)), len(at))
     pos = sky.navigation.states_at(names, sat, sky.t0, t_s[i]).pos_ecef
     _, el = _angles(pos, r_ecef[i])
     seen = np.any((el > np.deg2rad(table.mask_deg) - SEARCH_MARGIN_RAD).reshape(len(at), len(names)), axis=0)
-    return tuple(name for name, ok in zip(names, seen, strict=True) if ok)
+    return tuple(name for name, ok in zip(names, seen, strict=True) if ok) or names[:1]
 
 
 def _angles(sat_ecef: Array, r_ecef: Array) -> tuple[Array, Array]:

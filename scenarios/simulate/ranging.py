@@ -14,7 +14,7 @@ from factorgraph.problem import RangeModel
 from factorgraph.types import Array, BoolArray, IntArray
 from scenarios.flights.schema import Table, TagTable, nearest_hint
 from scenarios.simulate.fixes import epochs
-from scenarios.simulate.streams import Streams
+from scenarios.simulate.streams import Name, Streams
 from scenarios.simulate.trajectory import Trajectory
 
 Probability = Field(default=0.0, ge=0, le=1)
@@ -23,7 +23,7 @@ Probability = Field(default=0.0, ge=0, le=1)
 class RangeTable(Table):
     """A set of ranges; without `pairs`, every two tags that are not on one vehicle and not both anchors."""
 
-    name: str = "uwb"
+    name: Name = "uwb"
     tags: tuple[TagTable, ...] = Field(min_length=2)
     pairs: tuple[tuple[str, str], ...] = ()
     rate_hz: PositiveFloat = 10.0  # of every pair

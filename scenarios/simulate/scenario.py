@@ -26,6 +26,7 @@ from scenarios.simulate.fixes import HeightTable, PositionTable
 from scenarios.simulate.gnss import EnvironmentTable, GnssTable
 from scenarios.simulate.imu import ImuTable
 from scenarios.simulate.ranging import RangeTable
+from scenarios.simulate.streams import Name
 from scenarios.simulate.trajectory import Static, TrajectoryTable
 
 FOLDER = Path(__file__).resolve().parent.parent / "data" / "scenarios"
@@ -52,7 +53,7 @@ class ScenarioInfo(Table):
 class VehicleTable(Table):
     """A vehicle, or a base station whose antenna position is known."""
 
-    name: str
+    name: Name
     trajectory: TrajectoryTable
     imu: ImuTable | None = None
     gnss: GnssTable | None = None
@@ -79,6 +80,16 @@ class Scenario(Table):
     link: tuple[LinkTable, ...] = ()
     pair: tuple[LinkTable, ...] = ()
     settings: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Scenario:
+        names = {"vehicles": [v.name for v in self.vehicle], "range sets": [r.name for r in self.range]}
+        names |= {f"sensors of {v.name}": [p.name for p in v.positions] + [h.name for h in v.heights] for v in self.vehicle}
+        for what, given in names.items():
+            doubled = sorted({name for name in given if given.count(name) > 1})
+            if doubled:
+                raise InputError(f"names of {what} must be distinct; repeated: {', '.join(doubled)}")
+        return self
 
 
 def built_in() -> tuple[str, ...]:

@@ -7,9 +7,14 @@ number as it was.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 from zlib import crc32
 
 import numpy as np
+from pydantic import Field
+
+# of vehicles and sensors: they name random streams and files
+Name = Annotated[str, Field(pattern=r"^\w[\w.-]*$")]
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,7 +85,8 @@ def _named(names: tuple[str, ...], columns: Array) -> dict[str, Array]:
 
 def _columns(path: Path, columns: Columns) -> str:
     """Write named columns; returns the file's name."""
-    pacsv.write_csv(pa.table(dict(columns)), path, pacsv.WriteOptions(quoting_style="none"))
+    has_text = any(isinstance(column, list) for column in columns.values())
+    pacsv.write_csv(pa.table(dict(columns)), path, pacsv.WriteOptions(quoting_style="needed" if has_text else "none"))
     return path.name
 
 

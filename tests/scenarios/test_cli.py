@@ -248,15 +248,15 @@ def test_a_report_that_cannot_be_written_leaves_the_solution(flight: Path) -> No
 
 @posix
 @pytest.mark.usefixtures("plugins")
-@pytest.mark.parametrize("whom", ["parent", "terminal"])
-def test_ctrl_c_stops_with_130_and_says_what_is_left(whom: str, flight: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("send", "name"), [("kill", "SIGINT"), ("killpg", "SIGINT"), ("kill", "SIGTERM")])
+def test_an_interrupt_stops_with_130_and_says_what_is_left(send: str, name: str, flight: Path, tmp_path: Path) -> None:
     ready = tmp_path / "ready"
     env = {**_env(), "SLOW_READY": str(ready)}
     command = _command(("smooth", flight, "--method", "slow"))
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=flight, env=env, start_new_session=True) as process:
         _wait_for(ready)
         started = time.monotonic()
-        (os.kill if whom == "parent" else os.killpg)(process.pid, signal.SIGINT)
+        getattr(os, send)(process.pid, getattr(signal, name))
         _, err = process.communicate(timeout=60)
     assert process.returncode == guard.INTERRUPTED
     assert err == "relnav: stopped; nothing is written yet\n"

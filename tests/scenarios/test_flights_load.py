@@ -216,7 +216,11 @@ heights = [{ constant_m = 1.5, interval_s = 0.5 }]
 files = ["a.csv", "b.csv"]
 time = "t"
 scale = 0.001
-tags = [{ name = "1", vehicle = "uav", lever_b = [1, 0, 0] }, { name = "2", vehicle = "cart" }, { name = "A", position_m = [1, 2, 3] }]
+tags = [
+  { name = "1", vehicle = "uav", lever_b = [1, 0, 0] },
+  { name = "2", vehicle = "cart" },
+  { name = "A", position_m = [1, 2, 3] },
+]
 """
 
 

@@ -108,7 +108,7 @@ def _assert_same(a: object, b: object, atol: float = 0.0) -> None:
         assert b is None
         return
     assert isinstance(a, GnssStream | ImuStream | RangeStream | Truth) or dataclasses.is_dataclass(a)
-    for field in dataclasses.fields(a):  # type: ignore[arg-type]
+    for field in dataclasses.fields(a):
         x, y = getattr(a, field.name), getattr(b, field.name)
         if isinstance(x, np.ndarray):
             np.testing.assert_allclose(y, x, rtol=0, atol=atol, err_msg=field.name)
@@ -158,6 +158,9 @@ def test_a_written_flight_reads_back_as_the_same_problem(tmp_path: Path) -> None
         ('vehicle = "two" }', 'vehicle = "too" }', "tag t2: no vehicle too; did you mean two?"),
         ("h_m = 20.0 }", "h_m = 20.0, heading_deg = 3 }", "origin.heading_deg"),
         ('name = "small"', "name = ", "scenario: "),
+        ('name = "two"', 'name = "one"', "names of vehicles must be distinct; repeated: one"),
+        ('name = "two"', 'name = "../two"', "vehicle[1].name: String should match pattern"),
+        ('"G2W"]', '"G2"]', 'signal "G2": write system, band and attribute'),
     ],
 )
 def test_wrong_descriptions_name_the_key(old: str, new: str, message: str) -> None:

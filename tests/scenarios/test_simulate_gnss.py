@@ -196,5 +196,9 @@ def test_satellite_errors_are_common_to_receivers() -> None:
 def test_unknown_signals_and_empty_skies_are_errors() -> None:
     with pytest.raises(InputError, match='signal "G9X"'):
         observed("rest", GnssTable(signals=("G9X",)), 5.0, 0.0)
-    with pytest.raises(InputError, match="no satellite"):
+    with pytest.raises(InputError, match="no satellites of R"):
+        observed("rest", GnssTable(signals=("R1C",)), 5.0, 0.0)
+    with pytest.raises(InputError, match="ever tracked above 89 deg"):
+        observed("rest", GnssTable(mask_deg=89.0), 5.0, 0.0)
+    with pytest.raises(InputError, match="ever tracked"):
         observed("rest", GnssTable(outages=(Outage(start_s=-1, end_s=99),)), 5.0, 0.0)
