@@ -22,6 +22,7 @@ from rich.table import Table
 from factorgraph import registry
 from factorgraph.errors import InputError
 from factorgraph.measurements import ReadReport
+from factorgraph.problem import Settings
 from factorgraph.solution import Solution, Status
 from scenarios import guard
 from scenarios.cli import check_writable, describe_os_error
@@ -120,7 +121,8 @@ def _check_replaceable(folder: Path) -> None:
 
 def _estimate(args: argparse.Namespace, stages: Stages) -> Solution:
     stages("loading the engine")
-    registry.create(args.method)  # an unknown method is told before the files are read
+    registry.create(args.method)  # what is wrong here is told before the files are read
+    override(Settings(), args.set)
     stages("reading the flight")
     from scenarios.flights import load
 

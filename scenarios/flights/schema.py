@@ -514,10 +514,19 @@ class LinkTable(Table):
 def _check_settings(tree: object) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise PydanticCustomError("settings", "[settings] is a table", {})
-    settings: Settings = _replaced(Settings(), tree, "")
-    if not settings.systems or set(settings.systems) - set(SYSTEMS):
-        raise InputError(f'systems: "{settings.systems}" must hold letters of {SYSTEMS}, for instance "GE" for GPS and Galileo')
+    changed_settings(Settings(), tree)
     return tree
+
+
+def changed_settings(settings: Settings, tree: dict[str, Any]) -> Settings:
+    """Settings with the entries of a `[settings]` tree changed.
+
+    Raises InputError for an unknown key (with the nearest), a value of the wrong type and one that is refused.
+    """
+    changed: Settings = _replaced(settings, tree, "")
+    if not changed.systems or set(changed.systems) - set(SYSTEMS):
+        raise InputError(f'systems: "{changed.systems}" must hold letters of {SYSTEMS}, for instance "GE" for GPS and Galileo')
+    return changed
 
 
 def _replaced(owner: Any, tree: dict[str, Any], path: str) -> Any:
@@ -562,8 +571,7 @@ class Flight(Table):
     @property
     def problem_settings(self) -> Settings:
         """The settings with the file's changes applied to the defaults."""
-        settings: Settings = _replaced(Settings(), self.settings, "")
-        return settings
+        return changed_settings(Settings(), self.settings)
 
 
 def parse(text: str, source: str = FILE_NAME) -> Flight:

@@ -364,7 +364,7 @@ def test_settings_change_by_dotted_keys() -> None:
     [
         ("fix", "KEY=VALUE"),
         ("ambigity.fix=false", "did you mean ambiguity?"),
-        ("ambiguity=1", "ambiguity.fix"),
+        ("ambiguity=1", "ambiguity is a table of fix"),
         ("max_iterations=seven", "integer"),
         ("robust.code.kernel=hubr", "'huber'"),
         ("robust.code.width=-1", "positive"),
