@@ -13,6 +13,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 from rich.console import Console
@@ -104,6 +105,7 @@ def smooth(args: argparse.Namespace) -> int:
     """Estimate a flight and write solution, trajectories, summary and report."""
     outputs = Outputs(args.out)
     _check_replaceable(args.out / SOLUTION)
+    _check_figures(args)
     with _early_end(outputs), Stages(args.trace) as stages:
         solution = _estimate(args, stages)
         _write_results(solution, outputs, stages, args)
@@ -117,6 +119,11 @@ def _check_replaceable(folder: Path) -> None:
 
     if folder.exists() and not (folder / TEXT).exists():
         raise InputError(f"{folder} is there and not a solution that may be replaced; choose another --out")
+
+
+def _check_figures(args: argparse.Namespace) -> None:
+    if args.figures and find_spec("matplotlib") is None:
+        raise InputError("--figures needs matplotlib, which is not installed; try: pip install matplotlib")
 
 
 def _estimate(args: argparse.Namespace, stages: Stages) -> Solution:
@@ -263,6 +270,7 @@ def report(args: argparse.Namespace) -> int:
     from scenarios import solutions
 
     code = guard.DONE
+    _check_figures(args)
     for folder in args.solutions:
         outputs = Outputs(folder.parent if folder.name == SOLUTION else folder)
         check_writable(outputs.folder)

@@ -36,6 +36,7 @@ from factorgraph.solution import (
 from factorgraph.types import Array, BoolArray, IntArray
 
 FIXED_DIFFERENCES = 4  # double differences with integers that make an epoch fixed
+BETWEEN_EPOCHS_S = 2.0  # a state between two epochs no further apart shares their status
 
 
 def make_solution(problem: NavigationProblem, built: Built, result: Result, ratio: float, spent: dict[str, float], notes: list[str]) -> Solution:
@@ -46,7 +47,7 @@ def make_solution(problem: NavigationProblem, built: Built, result: Result, rati
     vehicles = tuple(_vehicle(v, cov) for v in graph.vehicles)
     ends = {v.name: v for v in graph.vehicles}
     links = {(d.link.reference, d.link.rover): d for d in built.links}
-    pairs = tuple(_pair(problem, p, ends, cov, links.get((p.reference, p.rover)), ratio) for p in problem.wanted_pairs)
+    pairs = tuple(_pair(problem, p, ends, cov, links, ratio) for p in problem.wanted_pairs)
     residuals = _residuals(graph, problem.settings.outlier_sigma)
     nis_t, nis, dof = _nis(graph, cov)
     return Solution(
@@ -148,13 +149,18 @@ def _vehicle(v: VehicleVariables, cov: JointCovariance | None) -> VehicleSolutio
 
 
 def _pair(
-    problem: NavigationProblem, pair: Link, ends: dict[str, VehicleVariables], cov: JointCovariance | None, link: GnssLink | None, ratio: float
+    problem: NavigationProblem,
+    pair: Link,
+    ends: dict[str, VehicleVariables],
+    cov: JointCovariance | None,
+    links: dict[tuple[str, str], GnssLink],
+    ratio: float,
 ) -> PairSolution:
     a, b = ends[pair.reference], ends[pair.rover]
     K = len(a.t_s)
     C = _enu_at(problem, a)
     P = pair_covariance(problem, a, b, cov) if cov is not None else np.full((K, 6, 6), np.nan)
-    fix, n_sat, ratios = _fix_status(link, b, K, ratio)
+    fix, n_sat, ratios = _pair_fix(pair, links, ends, K, ratio)
     truth, truth_v = _pair_truth(a, b, C)
     return PairSolution(
         pair.reference,
@@ -221,6 +227,21 @@ def interpolated(t: Array, x: Array, at: Array) -> Array:
     return np.column_stack([np.interp(at, t, x[:, j]) for j in range(x.shape[1])])
 
 
+def _pair_fix(
+    pair: Link, links: dict[tuple[str, str], GnssLink], ends: dict[str, VehicleVariables], K: int, ratio: float
+) -> tuple[IntArray, IntArray, Array]:
+    """Status of a pair: its own link's, or the worse of two links that lead from each end to the same reference."""
+    direct = links.get((pair.reference, pair.rover)) or links.get((pair.rover, pair.reference))
+    if direct is not None:
+        return _fix_status(direct, ends[direct.link.rover], K, ratio)
+    for middle in ends:
+        a, b = links.get((middle, pair.reference)), links.get((middle, pair.rover))
+        if a is not None and b is not None:
+            x, y = (_fix_status(d, ends[d.link.rover], K, ratio) for d in (a, b))
+            return np.minimum(x[0], y[0]), np.minimum(x[1], y[1]), x[2]
+    return _fix_status(None, ends[pair.rover], K, ratio)
+
+
 def _fix_status(link: GnssLink | None, rover: VehicleVariables, K: int, ratio: float) -> tuple[IntArray, IntArray, Array]:
     """Per grid time: Fix value, satellites in the differences, ratio."""
     fix, n_sat, ratios = np.zeros(K, np.int64), np.zeros(K, np.int64), np.full(K, np.nan)
@@ -244,6 +265,14 @@ def _fix_status(link: GnssLink | None, rover: VehicleVariables, K: int, ratio: f
     fix[any_phase] = Fix.FLOAT.value
     fix[differences >= 1] = Fix.PARTIAL.value
     fix[differences >= FIXED_DIFFERENCES] = Fix.FIXED.value
+    # states without an epoch of their own, between two epochs, are as good as the worse of these
+    seen = np.flatnonzero(n_sat > 0)
+    if len(seen):
+        before = seen[np.clip(np.searchsorted(seen, np.arange(K), side="right") - 1, 0, None)]
+        after = seen[np.clip(np.searchsorted(seen, np.arange(K)), None, len(seen) - 1)]
+        t = rover.t_s
+        short = (t[after] - t[before] <= BETWEEN_EPOCHS_S) & (before <= np.arange(K)) & (after >= np.arange(K))
+        fix = np.where((n_sat == 0) & short, np.minimum(fix[before], fix[after]), fix)
     ratios[fix >= Fix.PARTIAL.value] = ratio
     return fix, n_sat, ratios
 

@@ -7,9 +7,8 @@ a, both in n, rho = |s - a| and e = (s - a) / rho (user to satellite):
     Phi  = rho + c dt_u - c dt_s + T - I + lambda N
     -lambda D = e . (v_s - v_a) + c ddt_u - c ddt_s
 
-T and I are the Saastamoinen and Klobuchar models; what they leave is in the noise. Satellite velocities are those of
-the Earth-fixed frame; the Earth's rotation during the travel time adds omega_e x s to first order in tau, which cancels
-in differences and is far below Doppler noise otherwise.
+T and I are the Saastamoinen and Klobuchar models; what they leave is in the noise. Satellite velocities are turned with
+the positions; the rate's own second-order terms (below 1 mm/s) are left out.
 
 Source: spec common.md, section 5; IS-GPS-200 (Sagnac).
 """
@@ -37,12 +36,16 @@ def elevation_scale(el_rad: Array) -> Array:
     return np.sqrt(0.5 * (1 + 1 / np.sin(np.maximum(el_rad, np.deg2rad(3.0))) ** 2))
 
 
-def turned_satellites(sat_pos_ecef: Array, r_ecef: Array) -> Array:
-    """Satellite positions (n, 3) in the ECEF frame of reception at r_ecef (n, 3)."""
+def turned_satellites(sat_pos_ecef: Array, sat_vel_ecef: Array, r_ecef: Array) -> tuple[Array, Array]:
+    """Satellite positions and velocities (n, 3) in the ECEF frame of reception at r_ecef (n, 3)."""
     angle = OMEGA_E_RPS / C_MPS * np.linalg.norm(sat_pos_ecef - r_ecef, axis=-1)
     c, s = np.cos(angle), np.sin(angle)
-    x, y, z = sat_pos_ecef.T
-    return np.column_stack([c * x + s * y, c * y - s * x, z])
+
+    def turn(vector: Array) -> Array:
+        x, y, z = vector.T
+        return np.column_stack([c * x + s * y, c * y - s * x, z])
+
+    return turn(sat_pos_ecef), turn(sat_vel_ecef)
 
 
 def look_angles(los_n: Array) -> tuple[Array, Array]:
@@ -70,7 +73,7 @@ def prepare(stream: GnssStream, frame: LocalFrame, r_n: Array, clock_s: Array, k
     Positions good to 10 m leave 1e-4 m in single ranges and nothing in differences.
     """
     r_row = frame.to_ecef(r_n)[stream.epoch]
-    sat = turned_satellites(stream.sat_pos_ecef, r_row)
+    sat, sat_vel = turned_satellites(stream.sat_pos_ecef, stream.sat_vel_ecef, r_row)
     sat_n = frame.from_ecef(sat)
     lat, lon, h = geodesy.geodetic_from_ecef(r_row)
     los = sat - r_row
@@ -85,7 +88,7 @@ def prepare(stream: GnssStream, frame: LocalFrame, r_n: Array, clock_s: Array, k
     return Prepared(
         t_s=stream.t_s[stream.epoch] - clock_s[stream.epoch],
         sat_n=sat_n,
-        sat_vel_n=frame.rotate_from_ecef(stream.sat_vel_ecef),
+        sat_vel_n=frame.rotate_from_ecef(sat_vel),
         code_m=stream.code_m + stream.sat_clock_m - tropo - iono,
         phase_m=stream.phase_cyc * stream.wavelength_m + stream.sat_clock_m - tropo + iono,
         rate_mps=-stream.doppler_hz * stream.wavelength_m + stream.sat_clock_mps,
@@ -147,7 +150,7 @@ def single_point(stream: GnssStream, noise: GnssNoise, systems: str, klobuchar: 
     r = np.zeros((len(ids), 3))
     if stream.approx_ecef is not None and np.linalg.norm(stream.approx_ecef) > 6e6:
         r += stream.approx_ecef
-    sat, vel = stream.sat_pos_ecef[rows], stream.sat_vel_ecef[rows]
+    sat, vel = stream.sat_pos_ecef[rows], stream.sat_vel_ecef[rows]  # velocities are turned with the positions below
     base = stream.code_m[rows] + stream.sat_clock_m[rows]
     here = at_epoch.of_row
     sigma = np.full(len(rows), noise.absolute_code_m)
@@ -157,7 +160,7 @@ def single_point(stream: GnssStream, noise: GnssNoise, systems: str, klobuchar: 
     e = np.zeros((len(rows), 3))
     for iteration in range(12):
         rr = r[here]
-        s = turned_satellites(sat, rr)
+        s, vel = turned_satellites(sat, stream.sat_vel_ecef[rows], rr)
         d = s - rr
         rho = np.linalg.norm(d, axis=1)
         e = d / rho[:, None]

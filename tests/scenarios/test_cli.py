@@ -193,6 +193,15 @@ def test_a_saved_solution_gives_its_report_again(flight: Path) -> None:
 
 
 @pytest.mark.usefixtures("unguarded")
+def test_figures_without_matplotlib_are_refused_before_any_work(
+    flight: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("scenarios.commands.find_spec", lambda name: None)
+    assert cli.main(["smooth", str(flight), "--figures", "--out", str(flight / "out")]) == guard.FAILED
+    assert "pip install matplotlib" in one_error_line(capsys.readouterr().err)
+
+
+@pytest.mark.usefixtures("unguarded")
 def test_a_folder_that_is_not_a_solution_is_not_replaced(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (flight / "solution").mkdir()
     assert cli.main(["smooth", str(flight), "--out", str(flight)]) == guard.FAILED
