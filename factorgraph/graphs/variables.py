@@ -153,14 +153,16 @@ class VehicleVariables:
             return Point(r, v + np.einsum("nij,nj->ni", R, w_l), J_r, J_v)
         inc = q.increments
         db = self.bias[q.k] - self.preintegrated_bias[q.k]
-        dR = inc.dR @ exp_so3(np.einsum("nij,nj->ni", inc.dR_dbg, db[:, :3]))
+        # up to NEAR_S before its state no increments carry a point, so gravity alone must not: constant velocity and rate
+        ahead, behind = np.maximum(dt, 0.0), np.minimum(dt, 0.0)
+        dR = inc.dR @ exp_so3(np.einsum("nij,nj->ni", inc.dR_dbg, db[:, :3]) + rate * behind)
         dv = inc.dv + np.einsum("nij,nj->ni", inc.dv_dbg, db[:, :3]) + np.einsum("nij,nj->ni", inc.dv_dba, db[:, 3:])
         dp = inc.dp + np.einsum("nij,nj->ni", inc.dp_dbg, db[:, :3]) + np.einsum("nij,nj->ni", inc.dp_dba, db[:, 3:])
         g = self.gravity_terms(q.k)
-        turn = exp_so3(-self.frame.w_ie_n * dt)
+        turn = exp_so3(-self.frame.w_ie_n * ahead)
         Rt = turn @ R @ dR
-        r = self.r[q.k] + v * dt + 0.5 * g * dt**2 + np.einsum("nij,nj->ni", R, dp) + np.einsum("nij,nj->ni", Rt, q.lever_b)
-        vel = v + g * dt + np.einsum("nij,nj->ni", R, dv) + np.einsum("nij,nj->ni", Rt, w_l)
+        r = self.r[q.k] + v * dt + 0.5 * g * ahead**2 + np.einsum("nij,nj->ni", R, dp) + np.einsum("nij,nj->ni", Rt, q.lever_b)
+        vel = v + g * ahead + np.einsum("nij,nj->ni", R, dv) + np.einsum("nij,nj->ni", Rt, w_l)
         lever_k = np.einsum("nij,nj->ni", dR, q.lever_b)
         J_r, J_v = np.zeros((n, 3, 15)), np.zeros((n, 3, 15))
         J_r[:, :, :3], J_r[:, :, 3:6], J_r[:, :, 6:9] = -R @ skew(dp + lever_k), R, eye * dt[..., None]
