@@ -1,8 +1,7 @@
 """How good a solution is: errors against truth, their statistics, consistency, and the summary rows.
 
 Errors are estimate - truth; the attitude error phi obeys C_est = (I - [phi x]) C_true (`factorgraph.solution`).
-A covariance is judged by the normalised estimation error squared, e' P^-1 e, which is chi-square distributed with
-dim(e) degrees of freedom when P tells the truth. Source: Bar-Shalom et al. (2001), sec. 5.4.
+The mathematics of consistency is in `factorgraph.consistency`.
 """
 
 from __future__ import annotations
@@ -13,9 +12,9 @@ from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
-from scipy.stats import chi2
 
 from factorgraph.attitude import log_so3, matrix_from_quat
+from factorgraph.consistency import Consistency, judge, nees, standard_deviations
 from factorgraph.measurements import Truth
 from factorgraph.solution import ATT, POS, VEL, Fix, PairSolution, Solution, VehicleSolution
 from factorgraph.types import Array, BoolArray, IntArray
@@ -43,8 +42,8 @@ class ErrorSeries:
     @cached_property
     def nees(self) -> Consistency:
         """Normalised estimation error squared per epoch with its two-sided 95 % band."""
-        value = normalised_squares(self.error, self.P)
-        return consistency(self.t_s, value, np.full(len(value), float(self.error.shape[1])))
+        value = nees(self.error, self.P)
+        return judge(self.t_s, value, np.full(len(value), float(self.error.shape[1])))
 
     @property
     def display(self) -> tuple[float, str]:
@@ -62,24 +61,6 @@ class Statistics:
     p68: float
     p95: float
     maximum: float
-
-
-@dataclass(frozen=True, slots=True)
-class Consistency:
-    """A chi-square statistic per epoch with its two-sided band; epochs that cannot be judged are NaN."""
-
-    t_s: Array  # (n,)
-    value: Array  # (n,)
-    lower: Array  # (n,)
-    upper: Array  # (n,)
-    prob: float
-
-    @property
-    def share_inside(self) -> float:
-        """Share of judged epochs inside the band, NaN without any. Epochs of one run are correlated."""
-        judged = np.isfinite(self.value) & np.isfinite(self.upper)
-        inside = (self.value >= self.lower) & (self.value <= self.upper)
-        return float(np.mean(inside[judged])) if judged.any() else float("nan")
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +82,6 @@ class SummaryRow:
         if self.unit == "%":
             return f"{self.value:.1f} %"
         return f"{self.value:.4g} {self.unit}"
-
-
-def standard_deviations(P: Array) -> Array:
-    """Square roots (..., k) of the diagonals of covariances (..., k, k); NaN where negative or not estimated."""
-    variance = np.diagonal(P, axis1=-2, axis2=-1)
-    return np.sqrt(np.where(variance >= 0, variance, np.nan))
 
 
 def pair_name(pair: PairSolution) -> str:
@@ -175,36 +150,6 @@ def cdf(error: Array) -> tuple[Array, Array]:
     size = np.abs(e) if e.ndim == 1 else np.linalg.norm(e, axis=1)
     size = np.sort(size[np.isfinite(size)])
     return size, np.arange(1, len(size) + 1) / max(len(size), 1)
-
-
-def normalised_squares(error: Array, P: Array) -> Array:
-    """e' P^-1 e (n,) of errors (n, k) and covariances (n, k, k); NaN where P is unknown or not positive definite."""
-    k = error.shape[1]
-    sigma = standard_deviations(P)
-    rows = np.flatnonzero(np.isfinite(error).all(axis=1) & np.isfinite(P).all(axis=(1, 2)) & (sigma > 0).all(axis=1))
-    # unit diagonal first: definiteness is then judged free of units
-    A = P[rows] / (sigma[rows][:, :, None] * sigma[rows][:, None, :])
-    e = error[rows] / sigma[rows]
-    sum_squares, definite = np.zeros(len(rows)), np.ones(len(rows), bool)
-    for j in range(k):  # LDL' by elimination, all epochs at once
-        definite &= A[:, j, j] > 1e-12 * k
-        pivot = np.where(definite, A[:, j, j], 1.0)
-        sum_squares += e[:, j] ** 2 / pivot
-        factor = A[:, j + 1 :, j] / pivot[:, None]
-        e[:, j + 1 :] -= factor * e[:, j, None]
-        A[:, j + 1 :, j + 1 :] -= factor[:, :, None] * A[:, j, None, j + 1 :]
-    value = np.full(len(error), np.nan)
-    value[rows] = np.where(definite, sum_squares, np.nan)
-    return value
-
-
-def consistency(t_s: Array, value: Array, dof: Array, prob: float = 0.95) -> Consistency:
-    """Chi-square statistics (n,) with degrees of freedom (n,), fractional ones allowed, and their band."""
-    usable = np.where(dof > 0, dof, np.nan)
-    # the quantiles are costly and degrees of freedom repeat
-    distinct, index = np.unique(usable, return_inverse=True)
-    lower, upper = chi2.interval(prob, distinct)
-    return Consistency(t_s, np.where(np.isfinite(usable), value, np.nan), lower[index], upper[index], prob)
 
 
 def fix_percentage(fix: IntArray, status: Fix) -> float:
@@ -297,7 +242,7 @@ def _whole_rows(solution: Solution) -> list[SummaryRow]:
         rows.append(SummaryRow("solution", "outliers", int(np.sum(table.outlier)), ""))
         rows.append(SummaryRow("solution", "outliers, share", 100.0 * float(np.mean(table.outlier)), "%"))
     if len(diagnostics.nis):
-        inside = consistency(diagnostics.nis_t_s, diagnostics.nis, diagnostics.nis_dof).share_inside
+        inside = judge(diagnostics.nis_t_s, diagnostics.nis, diagnostics.nis_dof).share_inside
         rows.append(SummaryRow("solution", "NIS in band", 100.0 * inside, "%"))
     rows.append(SummaryRow("solution", "iterations", diagnostics.n_iterations, ""))
     rows.append(SummaryRow("solution", "runtime", total_runtime_s(diagnostics.runtime_s), "s"))

@@ -58,6 +58,7 @@ class Block:
     Jw: Array = field(init=False)  # (n, w) whitened
     u: Array = field(init=False)  # (n,) sqrt(w) / sigma
     active: BoolArray = field(init=False)  # (n,) rows in use
+    made: gtsam.NonlinearFactorGraph | None = field(default=None, init=False)  # its factors, until their keys change
 
     def __post_init__(self) -> None:
         self.w = np.ones(len(self.rows.sigma))
@@ -139,11 +140,15 @@ class Block:
         ends = np.cumsum((0, *self.widths())).tolist()
         return list(itertools.pairwise(ends))
 
-    def add_factors(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        edges = self.edges()
-        for f in range(len(self.rows.factor.start)):
-            i, j = self.slices(f)
-            graph.add(self._carrier(f, i, j, edges))
+    def factors(self) -> gtsam.NonlinearFactorGraph:
+        """The block's factors; made once."""
+        if self.made is None:
+            self.made = gtsam.NonlinearFactorGraph()
+            edges = self.edges()
+            for f in range(len(self.rows.factor.start)):
+                i, j = self.slices(f)
+                self.made.add(self._carrier(f, i, j, edges))
+        return self.made
 
     def _carrier(self, f: int, i: int, j: int, edges: list[tuple[int, int]]) -> gtsam.CustomFactor:
         """A factor that hands out rows i:j of what `whiten` computed."""
@@ -390,9 +395,10 @@ class GnssBlock(Block):
             self.scalar_cache[f] = ([*self.amb_key[arcs].tolist(), *self.iono_key[ionospheres].tolist()], columns)
         return self.scalar_cache[f]
 
-    def add_factors(self, graph: gtsam.NonlinearFactorGraph) -> None:
+    def renew(self) -> None:
+        """Call when ambiguities became constants or variables: the factors' keys change with them."""
         self.scalar_cache.clear()
-        Block.add_factors(self, graph)
+        self.made = None
 
     def _carrier(self, f: int, i: int, j: int, edges: list[tuple[int, int]]) -> gtsam.CustomFactor:
         if not self.scalars(f)[0]:

@@ -44,6 +44,7 @@ def posterior_bound(problem: NavigationProblem, integers_known: bool = True) -> 
         integers.start_ambiguities(data)
         if integers_known:
             data.block.amb_key[:] = 0
+            data.block.renew()
     built.graph.assemble()
     built.graph.take(built.graph.values)
     net = built.graph.covariance_net()

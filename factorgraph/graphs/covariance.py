@@ -32,10 +32,14 @@ def _fetch(va, vb, dim, node_of, row_of, var_first, var, size, out, out_first, t
     width = (out_first[n + 1] - out_first[n]) // size[n]
     block = out[out_first[n] : out_first[n + 1]].reshape(size[n], width)
     col = 0
+    found = False
     for k in range(var_first[n], var_first[n + 1]):
         if var[k] == second:
+            found = True
             break
         col += dim[var[k]]
+    if not found:
+        return  # no common clique: the target keeps what it has
     r0, df, ds = row_of[first], dim[first], dim[second]
     for a in range(df):
         for b in range(ds):
@@ -79,6 +83,22 @@ def _selected_inverse(dim, node_of, row_of, var_first, var, size, RS, out, out_f
             FF = result[:, :d] - FS @ G.T
             result[:, :d] = 0.5 * (FF + FF.T)
         out[out_first[n] : out_first[n + 1]] = result.ravel()
+
+
+@njit(cache=True)
+def _joints(groups, dim, node_of, row_of, var_first, var, size, out, out_first, target):  # type: ignore[no-untyped-def]
+    for g in range(len(groups)):
+        i = 0
+        for p in range(groups.shape[1]):
+            j = 0
+            for q in range(groups.shape[1]):
+                if q >= p:
+                    _fetch(groups[g, p], groups[g, q], dim, node_of, row_of, var_first, var, size, out, out_first, target[g], i, j)
+                j += dim[groups[g, q]]
+            i += dim[groups[g, p]]
+        for a in range(i):
+            for b in range(a):
+                target[g, a, b] = target[g, b, a]
 
 
 class JointCovariance:
@@ -138,31 +158,19 @@ class JointCovariance:
             self.dim, self.node_of, self.row_of, self.var_first, self.var, self.size, np.concatenate(blocks), self.out, self.out_first
         )
 
-    def block(self, a: int, b: int) -> Array | None:
-        """Covariance of keys a and b (d_a, d_b); None where the graph does not join them in one clique."""
-        i, j = self.index[a], self.index[b]
-        if self.node_of[i] < self.node_of[j]:
-            other = self.block(b, a)
-            return None if other is None else other.T
-        n = int(self.node_of[i])
-        rows = self.out[self.out_first[n] : self.out_first[n + 1]].reshape(int(self.size[n]), -1)
-        col = 0
-        for v in self.var[self.var_first[n] : self.var_first[n + 1]]:
-            if v == j:
-                r = int(self.row_of[i])
-                return rows[r : r + int(self.dim[i]), col : col + int(self.dim[j])]
-            col += int(self.dim[v])
-        return None
+    def block(self, a: int, b: int) -> Array:
+        """Covariance of keys a and b (d_a, d_b); NaN where the graph does not join them in one clique."""
+        da = int(self.dim[self.index[a]])
+        return self.joint([a, b])[:da, da:] if a != b else self.joint([a])
 
     def joint(self, keys: Sequence[int]) -> Array:
         """Joint covariance of several keys in the given order; pairs that share no clique are NaN."""
-        dims = [int(self.dim[self.index[k]]) for k in keys]
-        edges = np.concatenate([[0], np.cumsum(dims)]).astype(int)
-        P = np.full((edges[-1], edges[-1]), np.nan)
-        for i, a in enumerate(keys):
-            for j in range(i, len(keys)):
-                B = self.block(a, keys[j])
-                if B is not None:
-                    P[edges[i] : edges[i + 1], edges[j] : edges[j + 1]] = B
-                    P[edges[j] : edges[j + 1], edges[i] : edges[i + 1]] = B.T
-        return P
+        return np.asarray(self.joints([keys])[0])
+
+    def joints(self, groups: Sequence[Sequence[int]]) -> Array:
+        """Joint covariances (g, d, d) of groups of keys whose dimensions agree from group to group."""
+        at = np.array([[self.index[k] for k in keys] for keys in groups], np.int64)
+        d = int(self.dim[at[0]].sum())
+        target = np.full((len(at), d, d), np.nan)
+        _joints(at, self.dim, self.node_of, self.row_of, self.var_first, self.var, self.size, self.out, self.out_first, target)
+        return target

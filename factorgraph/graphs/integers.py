@@ -78,6 +78,7 @@ def start_ambiguities(data: GnssLink) -> None:
     for arc in np.flatnonzero(length == 0):
         block.amb_key[arc] = 0
         data.state[arc] = "unused"
+    block.renew()
 
 
 def split_slipped(data: GnssLink, settings: AmbiguitySettings) -> int:
@@ -161,6 +162,9 @@ def fix_integers(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNe
             data.block.amb_key[i] = 0
             data.state[i] = "fixed"
             count += 1
+    if count:
+        for data in links:
+            data.block.renew()
     return FixRound(count, float(result.ratio), float(result.success_rate))
 
 
@@ -176,4 +180,5 @@ def release_refused(links: list[GnssLink], settings: AmbiguitySettings) -> int:
                 data.make_free(int(i))
                 data.state[i] = "released"
                 released += 1
+                block.renew()
     return released

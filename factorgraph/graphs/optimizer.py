@@ -18,6 +18,7 @@ from factorgraph.graphs.blocks import Block, GnssBlock, RangeBlock
 from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.problem import Robust
 from factorgraph.solution import Status
+from factorgraph.types import Array, IntArray
 
 LAMBDA_START, LAMBDA_MAX = 1e-4, 1e8
 DIMENSION = {"x": 6, "b": 6, "p": 3, "v": 3, "a": 1, "i": 1, "s": 2}  # of a variable, by the letter of its key
@@ -44,29 +45,33 @@ class Graph:
     joints: list[Block] = field(default_factory=list)  # only for covariances: what is to share a clique
     values: gtsam.Values = field(default_factory=gtsam.Values)
     graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
-    last: list[int] = field(default_factory=list)
+    last: list[int] = field(default_factory=list)  # keys that are eliminated last
+    ambiguities: set[int] = field(default_factory=set)  # keys among the values
 
     def assemble(self) -> None:
-        """Collect factors and values; call again after ambiguities were fixed or released or factors renewed."""
+        """Collect factors and values; call again after ambiguities were fixed or released or native factors renewed."""
         self.graph = gtsam.NonlinearFactorGraph()
         self.graph.push_back(self.native)
         for block in self.blocks:
-            block.add_factors(self.graph)
-        self.values = gtsam.Values()
-        for vehicle in self.vehicles:
-            vehicle.insert(self.values)
-        self.last = []
-        used = set(self.graph.keyVector())
+            self.graph.push_back(block.factors())
+        if self.values.size() == 0:
+            for vehicle in self.vehicles:
+                vehicle.insert(self.values)
+            for gnss in self.gnss:
+                _put(self.values, gnss.iono_key, gnss.iono_value)
+        used = {int(k) for gnss in self.gnss for k in gnss.amb_key}
+        used &= set(self.graph.keyVector())
+        for k in self.ambiguities - used:
+            self.values.erase(k)
+        self.ambiguities = used
         for gnss in self.gnss:
-            for k, value in zip(gnss.amb_key, gnss.amb_value, strict=True):
-                if k in used:
-                    self.values.insert(int(k), np.array([value]))
-                    self.last.append(int(k))
-            for k, value in zip(gnss.iono_key, gnss.iono_value, strict=True):
-                self.values.insert(int(k), np.array([value]))
+            mine = np.array([int(k) in used for k in gnss.amb_key], bool)
+            _put(self.values, gnss.amb_key[mine], gnss.amb_value[mine])
+        self.last = sorted(used)
         for block in self.ranges:
             if block.parameter is not None and block.parameter not in self.last:
-                self.values.insert(block.parameter, block.value.copy())
+                if not self.values.exists(block.parameter):
+                    self.values.insert(block.parameter, block.value.copy())
                 self.last.append(block.parameter)
 
     def take(self, values: gtsam.Values) -> None:
@@ -101,7 +106,7 @@ class Graph:
         for block in self.joints:
             block.predict()
             block.whiten()
-            block.add_factors(extra)
+            extra.push_back(block.factors())
         linear.push_back(extra.linearize(self.values))
         return eliminate(linear, self.ordering(linear))
 
@@ -109,6 +114,14 @@ class Graph:
         if self.last:
             return gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, self.last)
         return gtsam.Ordering.ColamdGaussianFactorGraph(linear)
+
+
+def _put(values: gtsam.Values, keys: IntArray, scalars: Array) -> None:
+    for k, value in zip(keys, scalars, strict=True):
+        if values.exists(int(k)):
+            values.update(int(k), np.array([value]))
+        else:
+            values.insert(int(k), np.array([value]))
 
 
 def eliminate(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.GaussianBayesNet | None:

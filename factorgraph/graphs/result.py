@@ -140,9 +140,8 @@ def _vehicle(v: VehicleVariables, cov: JointCovariance | None) -> VehicleSolutio
         return VehicleSolution(v.name, v.t_s, v.r, v.v, np.full((K, 4), np.nan), nan3, nan3, P, v.vehicle.truth, True)
     if cov is not None:
         n = 15 if v.mode == "imu" else 6
-        for k in range(K):
-            T = _state_map(v, k)[:n]
-            P[k, :n, :n] = T @ cov.joint(v.keys(k)) @ T.T
+        T = np.array([_state_map(v, k)[:n] for k in range(K)])
+        P[:, :n, :n] = T @ cov.joints([v.keys(k) for k in range(K)]) @ np.swapaxes(T, 1, 2)
     if v.mode == "imu":
         return VehicleSolution(v.name, v.t_s, v.r, v.v, quat_from_matrix(v.R), v.bias[:, :3], v.bias[:, 3:], P, v.vehicle.truth)
     return VehicleSolution(v.name, v.t_s, v.r, v.v, np.full((K, 4), np.nan), nan3, nan3, P, v.vehicle.truth)
@@ -188,20 +187,14 @@ def pair_covariance(problem: NavigationProblem, a: VehicleVariables, b: VehicleV
     C = _enu_at(problem, a)
     CC = np.zeros((len(C), 6, 6))
     CC[:, :3, :3], CC[:, 3:, 3:] = C, C
-    P = np.array([_relative_covariance(a, b, k, cov) for k in range(len(C))])
-    return np.asarray(CC @ P @ np.swapaxes(CC, 1, 2))
-
-
-def _relative_covariance(a: VehicleVariables, b: VehicleVariables, k: int, cov: JointCovariance) -> Array:
-    keys, blocks = [], []
+    keys = [[key for v in (a, b) for key in v.keys(k)[:2]] for k in range(len(C))]
+    T = []
     for v, sign in ((a, -1.0), (b, 1.0)):
-        if v.mode == "fixed":
-            continue
-        keys += list(v.keys(k)[:2])
-        width = 9 if v.mode == "imu" else 6
-        blocks.append(sign * _state_map(v, k)[:6, :width])
-    T = np.hstack(blocks)
-    return np.asarray(T @ cov.joint(keys) @ T.T)
+        if v.mode != "fixed":
+            width = 9 if v.mode == "imu" else 6
+            T.append(np.array([sign * _state_map(v, k)[:6, :width] for k in range(len(C))]))
+    CT = CC @ np.concatenate(T, axis=2)
+    return np.asarray(CT @ cov.joints(keys) @ np.swapaxes(CT, 1, 2))
 
 
 def _pair_truth(a: VehicleVariables, b: VehicleVariables, C: Array) -> tuple[Array | None, Array | None]:
@@ -357,10 +350,12 @@ def _nis(graph: Graph, cov: JointCovariance | None) -> tuple[Array, Array, Array
         n_clocks = np.zeros(len(starts))
         if b.rows.clocks is not None:
             np.add.at(n_clocks, b.rows.factor.of_row[b.rows.clocks.start], 1.0)
+        keys = [b.keys(f) for f in range(len(starts))]
+        alike = len({len(k) for k in keys}) == 1
+        P = cov.joints(keys) if alike and keys[0] else [cov.joint(k) if k else np.zeros((0, 0)) for k in keys]
         for f in range(len(starts)):
-            keys = b.keys(f)
             J = np.hstack(b.columns(f))
-            used = float(np.einsum("ij,jk,ik->", J, cov.joint(keys), J)) if keys else 0.0
+            used = float(np.sum((J @ P[f]) * J))
             total[k[f]] += sq[f]
             dof[k[f]] += max(rows[f] - n_clocks[f] - used, 0.0)
     seen = dof > 0
@@ -372,8 +367,7 @@ def _parameters(graph: Graph, cov: JointCovariance | None) -> dict[str, tuple[fl
     for block in graph.ranges:
         if block.parameter is None:
             continue
-        P = cov.block(block.parameter, block.parameter) if cov is not None else None
-        sigma = np.sqrt(np.diag(P)) if P is not None else np.full(2, np.nan)
+        sigma = np.sqrt(np.diag(cov.joint([block.parameter]))) if cov is not None else np.full(2, np.nan)
         name = block.rows.source if block.model.per_pair else block.model.stream.name
         if block.model.bias_sigma_m > 0:
             out[f"{name} bias [m]"] = (float(block.value[0]), float(sigma[0]))

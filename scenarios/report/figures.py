@@ -14,9 +14,10 @@ from matplotlib.figure import Figure
 from scipy.stats import norm
 
 from factorgraph.attitude import euler_from_matrix, matrix_from_quat
+from factorgraph.consistency import standard_deviations
 from factorgraph.solution import ATT, Fix, PairSolution, ResidualTable, Solution, VehicleSolution
 from factorgraph.types import Array
-from scenarios.metrics import ErrorSeries, cdf, euler_sigma, pair_name, solution_errors, standard_deviations
+from scenarios.metrics import ErrorSeries, cdf, euler_sigma, pair_name, solution_errors
 from scenarios.report.chart import ENU, FIX_COLOURS, FIX_NAMES, TIME_TITLE
 from scenarios.report.series import ALERT_COLOUR, AXIS_COLOURS, BAND_SIGMAS, CYCLE, TRUTH_COLOUR, normalised
 

@@ -21,15 +21,14 @@ from pathlib import Path
 import numpy as np
 from plotly.offline import get_plotlyjs, get_plotlyjs_version
 
+from factorgraph.consistency import judge, standard_deviations
 from factorgraph.solution import Fix, Solution, Status
 from factorgraph.types import Array
 from scenarios.metrics import (
     ErrorSeries,
-    consistency,
     fix_percentage,
     pair_name,
     solution_errors,
-    standard_deviations,
     statistics,
     total_runtime_s,
 )
@@ -287,7 +286,7 @@ def _cards(solution: Solution, errors: Sequence[ErrorSeries]) -> list[tuple[str,
         share = f"{100 * np.mean(table.outlier):.2f} % of {len(table.t_s):,} residuals"
         cards.append(("Outliers", f"{int(np.sum(table.outlier)):,}", share))
     if np.isfinite(diagnostics.nis).any():
-        inside = consistency(diagnostics.nis_t_s, diagnostics.nis, diagnostics.nis_dof).share_inside
+        inside = judge(diagnostics.nis_t_s, diagnostics.nis, diagnostics.nis_dof).share_inside
         cards.append(("NIS in 95 % band", f"{100 * inside:.1f} %", "of epochs"))
     detail = f"{diagnostics.n_iterations} iterations, {diagnostics.status.value}"
     return [*cards, ("Runtime", f"{runtime_s:.1f} s" if np.isfinite(runtime_s) else "–", detail)]

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
+from factorgraph.consistency import judge
 from factorgraph.solution import Diagnostics, ResidualTable
 from factorgraph.types import Array, IntArray
-from scenarios.metrics import ErrorSeries, cdf, consistency
+from scenarios.metrics import ErrorSeries, cdf
 from scenarios.report.chart import (
     CLOUD_LIMIT,
     UNITS,
@@ -121,7 +122,7 @@ def nis(diagnostics: Diagnostics, limit: int) -> Chart | None:
     """Normalised innovation squared per epoch with its 95 % band; None without any."""
     if not np.isfinite(diagnostics.nis).any():
         return None
-    test = consistency(diagnostics.nis_t_s, diagnostics.nis, diagnostics.nis_dof)
+    test = judge(diagnostics.nis_t_s, diagnostics.nis, diagnostics.nis_dof)
     note = f"{100 * test.share_inside:.1f} % of epochs lie inside the 95 % band. {thin_note(len(test.t_s), limit)}".strip()
     panel = Panel(
         "squared residuals",

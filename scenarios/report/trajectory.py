@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from factorgraph.attitude import euler_from_matrix, matrix_from_quat
+from factorgraph.consistency import standard_deviations
 from factorgraph.solution import ATT, BA, BG, POS, Fix, PairSolution, VehicleSolution
 from factorgraph.types import Array, BoolArray
-from scenarios.metrics import euler_sigma, pair_name, standard_deviations
+from scenarios.metrics import euler_sigma, pair_name
 from scenarios.report.chart import (
     CLOUD_LIMIT,
     ENU,

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from factorgraph.attitude import euler_from_matrix, exp_so3, matrix_from_euler, quat_from_matrix
+from factorgraph.consistency import standard_deviations
 from factorgraph.measurements import Truth
 from factorgraph.solution import (
     ATT,
@@ -60,19 +61,6 @@ def test_cdf_is_the_share_not_above() -> None:
     np.testing.assert_allclose(share, [0.25, 0.5, 0.75, 1])
 
 
-def test_normalised_squares_agree_with_a_solver_and_refuse_bad_covariances() -> None:
-    rng = np.random.default_rng(3)
-    A = rng.standard_normal((50, 4, 4)) * [1e-3, 1.0, 30.0, 1e4]  # units apart
-    P = np.swapaxes(A, 1, 2) @ A
-    e = rng.standard_normal((50, 4))
-    P[0], P[1, 2, 2], P[2] = np.nan, -1.0, np.ones((4, 4))  # unknown, negative, singular
-    P[3] = np.eye(4) + 2 * (np.eye(4, k=1) + np.eye(4, k=-1))  # indefinite with a positive diagonal
-    value = metrics.normalised_squares(e, P)
-    assert np.isnan(value[:4]).all()
-    expected = np.sum(e[4:] * np.linalg.solve(P[4:], e[4:, :, None])[..., 0], axis=1)
-    np.testing.assert_allclose(value[4:], expected, rtol=1e-6)
-
-
 @pytest.mark.parametrize("optimism", [1.0, 3.0, 1 / 3])
 def test_nees_band_holds_95_percent_only_of_honest_errors(optimism: float) -> None:
     rng = np.random.default_rng(11)
@@ -83,12 +71,6 @@ def test_nees_band_holds_95_percent_only_of_honest_errors(optimism: float) -> No
     lower, upper = np.diff(chi2.cdf(np.array(chi2.interval(0.95, 3)) / optimism**2, 3)) + np.array([-1, 1]) * 4 * 0.5 / np.sqrt(n)
     assert lower < found.nees.share_inside < upper
     assert (lower > 0.9) == (optimism == 1.0)
-
-
-def test_consistency_takes_fractional_and_empty_degrees_of_freedom() -> None:
-    test = metrics.consistency(np.arange(3.0), np.array([2.0, 0.0, 99.0]), np.array([2.5, 0.0, 2.5]))
-    assert np.isnan(test.value[1]) and np.isnan(test.upper[1])
-    assert test.share_inside == 0.5
 
 
 def _vehicle(t_s: Array, phi: Array | None = None) -> tuple[VehicleSolution, Callable[[Array], Truth]]:
@@ -483,5 +465,5 @@ def test_blocks_of_the_example_obey_its_covariances() -> None:
     assert vehicle.truth is not None
     for block, found in zip((POS, ATT), (0, 2), strict=True):
         series_of_block = metrics.vehicle_errors(vehicle)[found]
-        share = np.mean(np.abs(series_of_block.error) < metrics.standard_deviations(vehicle.P[:, block, block]))
+        share = np.mean(np.abs(series_of_block.error) < standard_deviations(vehicle.P[:, block, block]))
         assert 0.5 < share < 0.85  # 0.68, errors of neighbouring epochs are correlated

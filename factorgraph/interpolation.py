@@ -1,0 +1,172 @@
+"""A solution between its states, up to IMU rate.
+
+From the state k before, at its estimated bias, increments of the IMU (`factorgraph.models.preintegration`) carry the
+vehicle to t = t_k + dt (`factorgraph.graphs.variables`):
+
+    R_p = Exp(-w_ie dt) R_k dR,   v_p = v_k + (g - 2 w_ie x v_k) dt + R_k dv,
+    r_p = r_k + v_k dt + (g - 2 w_ie x v_k) dt^2 / 2 + R_k dp
+
+At the next state, T later, this misses by e_r, e_v and phi = Log(R_p' R_k+1). What is missing is spread over the
+interval, with u = dt / T:
+
+    r = r_p + c(dt),   v = v_p + dc/dt,   R = R_p Exp(u phi)
+
+c is the cubic that is zero with zero slope at the start and e_r with slope e_v at the end. That is the mean of white
+accelerometer and gyroscope noise given its integrals, and removes constant errors of both exactly to first order.
+Position, velocity and attitude are continuous and equal the solution at its states, and v is the derivative of r.
+Without an IMU the same equations with dR = I, dv = dp = 0 and g - 2 w_ie x v = 0 are cubic Hermite interpolation, the
+mean of the white-noise-on-acceleration prior, and the shortest rotation.
+
+Covariances, biases and ambiguity status between states are those of the nearest earlier state.
+
+Source: Barfoot (2017), sec. 3.4, for the interpolation that the prior implies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph.attitude import exp_so3, log_so3, matrix_from_quat, quat_from_matrix
+from factorgraph.errors import InputError
+from factorgraph.geodesy import C_en, LocalFrame, geodetic_from_ecef
+from factorgraph.measurements import ImuStream
+from factorgraph.models import preintegration
+from factorgraph.problem import NavigationProblem
+from factorgraph.solution import PairSolution, Solution, VehicleSolution
+from factorgraph.types import Array, IntArray
+
+CHUNK = 8192  # times at once: bounds memory and stays in the cache
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Motion of a vehicle at any times; scalar parts of the quaternions are not negative."""
+
+    t_s: Array  # (n,)
+    r_n: Array  # (n, 3) local frame
+    v_n: Array  # (n, 3)
+    q_nb: Array  # (n, 4) NaN without attitude
+
+
+@dataclass(frozen=True, slots=True)
+class PairTrajectory:
+    """Rover relative to reference at any times, resolved east-north-up at the reference's position."""
+
+    t_s: Array  # (n,)
+    baseline_enu: Array  # (n, 3) rover - reference
+    velocity_enu: Array  # (n, 3)
+
+
+def interpolate(vehicle: VehicleSolution, imu: ImuStream | None, frame: LocalFrame, t_s: Array) -> Trajectory:
+    """The vehicle's motion at times t_s (n,), in any order.
+
+    `imu` is used where the solution has an attitude, else, or without it, cubic Hermite interpolation. Raises InputError
+    (a ValueError) for times outside the solution.
+    """
+    t_s = np.asarray(t_s, float)
+    _check_inside(vehicle.name, vehicle.t_s, t_s)
+    if imu is not None and not np.isfinite(vehicle.q_nb).any():
+        imu = None
+    R = matrix_from_quat(vehicle.q_nb)
+    missing = _missing(vehicle, R, imu, frame)
+    r_n, v_n, q_nb = np.empty((len(t_s), 3)), np.empty((len(t_s), 3)), np.empty((len(t_s), 4))
+    order = np.argsort(t_s, kind="stable")
+    for first in range(0, len(order), CHUNK):
+        rows = order[first : first + CHUNK]
+        k = earlier_state(vehicle.t_s, t_s[rows])
+        dt = t_s[rows] - vehicle.t_s[k]
+        r, v, C = _carried(vehicle, R, imu, frame, k, dt)
+        e_r, e_v, phi, T = (x[k] for x in missing)
+        u, step = (dt / T)[:, None], T[:, None]
+        r_n[rows] = r + u * u * ((3 - 2 * u) * e_r + (u - 1) * step * e_v)
+        v_n[rows] = v + u * (6 * (1 - u) / step * e_r + (3 * u - 2) * e_v)
+        q_nb[rows] = quat_from_matrix(C @ exp_so3(u * phi))
+    return Trajectory(t_s, r_n, v_n, q_nb)
+
+
+def interpolate_pair(
+    reference: VehicleSolution,
+    rover: VehicleSolution,
+    reference_imu: ImuStream | None,
+    rover_imu: ImuStream | None,
+    frame: LocalFrame,
+    t_s: Array,
+) -> PairTrajectory:
+    """Baseline and relative velocity at times t_s (n,). Raises InputError for times outside either solution."""
+    a, b = interpolate(reference, reference_imu, frame, t_s), interpolate(rover, rover_imu, frame, t_s)
+    return _relative(a, b, frame)
+
+
+def resample(solution: Solution, problem: NavigationProblem, rate_hz: float | None = None) -> Solution:
+    """The solution with vehicles and pairs at `rate_hz`, or at the times of each vehicle's IMU.
+
+    With a rate, times are multiples of 1 / rate since t0. Without, a pair follows its reference's IMU, else its rover's;
+    what has no IMU keeps its states. The truth of pairs is known at the states only and left out.
+    Raises InputError for a rate that is not positive.
+    """
+    if rate_hz is not None and not 0 < rate_hz < np.inf:
+        raise InputError(f"the rate of trajectories must be positive, got {rate_hz} Hz")
+    imus = {v.name: v.imu for v in problem.vehicles}
+    vehicles = [_vehicle_at(v, imus.get(v.name), solution.frame, _times(v.t_s, rate_hz, imus.get(v.name))) for v in solution.vehicles]
+    pairs = [_pair_at(solution, p, imus, rate_hz) for p in solution.pairs]
+    return replace(solution, vehicles=tuple(vehicles), pairs=tuple(pairs))
+
+
+def earlier_state(state_s: Array, t_s: Array) -> IntArray:
+    """Index (n,) of the last state at or before each time (n,)."""
+    return np.asarray(np.searchsorted(state_s, t_s, side="right") - 1)
+
+
+def _check_inside(name: str, state_s: Array, t_s: Array) -> None:
+    if not len(t_s):
+        return
+    if not len(state_s):
+        raise InputError(f"{name}: the solution has no states to interpolate between")
+    low, high = float(np.min(t_s)), float(np.max(t_s))
+    if not (state_s[0] <= low and high <= state_s[-1]):  # NaN included
+        raise InputError(f"{name}: times from {low:g} s to {high:g} s are not within the solution, {state_s[0]:g} s to {state_s[-1]:g} s")
+
+
+def _carried(
+    vehicle: VehicleSolution, R: Array, imu: ImuStream | None, frame: LocalFrame, k: IntArray, dt_s: Array
+) -> tuple[Array, Array, Array]:
+    """r_p, v_p (n, 3) and R_p (n, 3, 3): states k (n,), sorted, carried forward by dt_s (n,)."""
+    r, v, dt = vehicle.r_n[k], vehicle.v_n[k], dt_s[:, None]
+    if imu is None:
+        return r + v * dt, v, R[k]
+    bias = np.hstack([vehicle.bias_gyro[k], vehicle.bias_accel[k]])
+    start = vehicle.t_s[k]
+    inc = preintegration.integrate(imu, start, start + dt_s, bias)
+    g = frame.gravity(r) - 2 * np.cross(frame.w_ie_n, v)
+    dp, dv = (np.squeeze(R[k] @ x[:, :, None], axis=2) for x in (inc.dp, inc.dv))
+    return r + v * dt + 0.5 * g * dt**2 + dp, v + g * dt + dv, exp_so3(-frame.w_ie_n * dt) @ R[k] @ inc.dR
+
+
+def _missing(vehicle: VehicleSolution, R: Array, imu: ImuStream | None, frame: LocalFrame) -> tuple[Array, Array, Array, Array]:
+    """e_r, e_v, phi (K, 3) and T (K,) of the intervals after each state; the last state has none of it."""
+    K = len(vehicle.t_s)
+    e_r, e_v, phi, T = np.zeros((K, 3)), np.zeros((K, 3)), np.zeros((K, 3)), np.ones(K)
+    if K > 1:
+        T[:-1] = np.diff(vehicle.t_s)
+        r, v, C = _carried(vehicle, R, imu, frame, np.arange(K - 1), T[:-1])
+        e_r[:-1], e_v[:-1] = vehicle.r_n[1:] - r, vehicle.v_n[1:] - v
+        phi[:-1] = log_so3(np.swapaxes(C, 1, 2) @ R[1:])
+    return e_r, e_v, phi, T
+
+
+def _relative(a: Trajectory, b: Trajectory, frame: LocalFrame) -> PairTrajectory:
+    lat, lon, _ = geodetic_from_ecef(frame.to_ecef(a.r_n))
+    C = C_en(lat, lon) @ frame.C_en.T
+    baseline, velocity = (np.squeeze(C @ x[:, :, None], axis=2) for x in (b.r_n - a.r_n, b.v_n - a.v_n))
+    return PairTrajectory(a.t_s, baseline, velocity)
+
+
+def _times(state_s: Array, rate_hz: float | None, imu: ImuStream | None) -> Array:
+    """Times within the states: multiples of 1 / rate, else those of the IMU, else the states'."""
+    if rate_hz is None:
+        candidates = state_s if imu is None else imu.t_s
+    elif len(state_s):
+        candidates = np.arange(np.ceil(state_s[0] * rate_hz - 1e-6), np.floor(state_s[-1] * rate_hz + 1e-6) + 1) / rate_hz
+    ...
