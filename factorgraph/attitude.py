@@ -33,7 +33,7 @@ def exp_so3(phi: Array) -> Array:
     s = np.where(small, 1 - a2 / 6, np.sin(a_safe) / a_safe)
     c = np.where(small, 0.5 - a2 / 24, (1 - np.cos(a_safe)) / a_safe**2)
     S = skew(phi)
-    return np.eye(3) + s * S + c * (S @ S)
+    return np.asarray(np.eye(3) + s * S + c * (S @ S))
 
 
 def log_so3(C: Array) -> Array:
@@ -50,7 +50,7 @@ def matrix_from_quat(q: Array) -> Array:
     q = np.asarray(q, float)
     w, v = q[..., 0, None, None], q[..., 1:]
     S = skew(v)
-    return np.eye(3) + 2 * w * S + 2 * (S @ S)
+    return np.asarray(np.eye(3) + 2 * w * S + 2 * (S @ S))
 
 
 def quat_from_matrix(C: Array) -> Array:
@@ -70,7 +70,7 @@ def quat_from_matrix(C: Array) -> Array:
         cand[..., row, :] = np.stack(values, axis=-1)
     q = np.take_along_axis(cand, k[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., :1] < 0, -q, q)
+    return np.asarray(np.where(q[..., :1] < 0, -q, q))
 
 
 def matrix_from_euler(pitch_rad: Array | float, roll_rad: Array | float, heading_rad: Array | float) -> Array:

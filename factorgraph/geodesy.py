@@ -62,13 +62,13 @@ def gravitation_ecef(r_ecef: Array) -> Array:
     s2 = r[..., 2:3] ** 2 / r2
     k = 1.5 * J2 * A_M**2 / r2
     scale = np.concatenate([1 + k * (1 - 5 * s2), 1 + k * (1 - 5 * s2), 1 + k * (3 - 5 * s2)], axis=-1)
-    return -MU_M3S2 / r2**1.5 * r * scale
+    return np.asarray(-MU_M3S2 / r2**1.5 * r * scale)
 
 
 def centrifugal_ecef(r_ecef: Array) -> Array:
     """Centrifugal acceleration (..., 3) of a point turning with the Earth, ECEF [m/s^2]."""
     r = np.asarray(r_ecef, float)
-    return OMEGA_E_RPS**2 * r * np.array([1.0, 1.0, 0.0])
+    return np.asarray(OMEGA_E_RPS**2 * r * np.array([1.0, 1.0, 0.0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +109,11 @@ class LocalFrame:
 
     def rotate_to_ecef(self, v_n: Array) -> Array:
         return np.asarray(v_n, float) @ self.C_en
+
+    def C_to_enu(self, r_n: Array) -> Array:
+        """Rotations (..., 3, 3) from n to east-north-up at positions (..., 3) in n."""
+        lat, lon, _ = geodetic_from_ecef(self.to_ecef(r_n))
+        return C_en(lat, lon) @ self.C_en.T
 
     def gravitation(self, r_n: Array) -> Array:
         """Attraction (..., 3) at positions in n, resolved in n [m/s^2]."""

@@ -14,8 +14,9 @@ interval, with u = dt / T:
 c is the cubic that is zero with zero slope at the start and e_r with slope e_v at the end. That is the mean of white
 accelerometer and gyroscope noise given its integrals, and removes constant errors of both exactly to first order.
 Position, velocity and attitude are continuous and equal the solution at its states, and v is the derivative of r.
-Without an IMU the same equations with dR = I, dv = dp = 0 and g - 2 w_ie x v = 0 are cubic Hermite interpolation, the
-mean of the white-noise-on-acceleration prior, and the shortest rotation.
+Without an IMU, and between states that IMU samples are missing between, the same equations with R_p = R_k, v_p = v_k and
+r_p = r_k + v_k dt are cubic Hermite interpolation, the mean of the white-noise-on-acceleration prior, and the shortest
+rotation.
 
 Covariances, biases and ambiguity status between states are those of the nearest earlier state.
 
@@ -30,14 +31,14 @@ import numpy as np
 
 from factorgraph.attitude import exp_so3, log_so3, matrix_from_quat, quat_from_matrix
 from factorgraph.errors import InputError
-from factorgraph.geodesy import C_en, LocalFrame, geodetic_from_ecef
+from factorgraph.geodesy import LocalFrame
 from factorgraph.measurements import ImuStream
 from factorgraph.models import preintegration
 from factorgraph.problem import NavigationProblem
 from factorgraph.solution import PairSolution, Solution, VehicleSolution
-from factorgraph.types import Array, IntArray
+from factorgraph.types import Array, BoolArray, IntArray
 
-CHUNK = 8192  # times at once: bounds memory and stays in the cache
+CHUNK = 32_768  # times at once, which bounds memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,22 +63,21 @@ class PairTrajectory:
 def interpolate(vehicle: VehicleSolution, imu: ImuStream | None, frame: LocalFrame, t_s: Array) -> Trajectory:
     """The vehicle's motion at times t_s (n,), in any order.
 
-    `imu` is used where the solution has an attitude, else, or without it, cubic Hermite interpolation. Raises InputError
-    (a ValueError) for times outside the solution.
+    `imu` is used where the solution has attitude and biases. Raises InputError (a ValueError) for times outside the
+    solution.
     """
     t_s = np.asarray(t_s, float)
     _check_inside(vehicle.name, vehicle.t_s, t_s)
-    if imu is not None and not np.isfinite(vehicle.q_nb).any():
-        imu = None
     R = matrix_from_quat(vehicle.q_nb)
-    missing = _missing(vehicle, R, imu, frame)
+    has_imu = _has_imu(vehicle, imu)
+    missing = _missing(vehicle, R, imu, has_imu, frame)
     r_n, v_n, q_nb = np.empty((len(t_s), 3)), np.empty((len(t_s), 3)), np.empty((len(t_s), 4))
     order = np.argsort(t_s, kind="stable")
     for first in range(0, len(order), CHUNK):
         rows = order[first : first + CHUNK]
         k = earlier_state(vehicle.t_s, t_s[rows])
         dt = t_s[rows] - vehicle.t_s[k]
-        r, v, C = _carried(vehicle, R, imu, frame, k, dt)
+        r, v, C = _carried(vehicle, R, imu, has_imu, frame, k, dt)
         e_r, e_v, phi, T = (x[k] for x in missing)
         u, step = (dt / T)[:, None], T[:, None]
         r_n[rows] = r + u * u * ((3 - 2 * u) * e_r + (u - 1) * step * e_v)
@@ -96,7 +96,8 @@ def interpolate_pair(
 ) -> PairTrajectory:
     """Baseline and relative velocity at times t_s (n,). Raises InputError for times outside either solution."""
     a, b = interpolate(reference, reference_imu, frame, t_s), interpolate(rover, rover_imu, frame, t_s)
-    return _relative(a, b, frame)
+    C = frame.C_to_enu(a.r_n)
+    return PairTrajectory(a.t_s, _rotated(C, b.r_n - a.r_n), _rotated(C, b.v_n - a.v_n))
 
 
 def resample(solution: Solution, problem: NavigationProblem, rate_hz: float | None = None) -> Solution:
@@ -109,7 +110,9 @@ def resample(solution: Solution, problem: NavigationProblem, rate_hz: float | No
     if rate_hz is not None and not 0 < rate_hz < np.inf:
         raise InputError(f"the rate of trajectories must be positive, got {rate_hz} Hz")
     imus = {v.name: v.imu for v in problem.vehicles}
-    vehicles = [_vehicle_at(v, imus.get(v.name), solution.frame, _times(v.t_s, rate_hz, imus.get(v.name))) for v in solution.vehicles]
+    vehicles = [
+        _vehicle_at(v, imus.get(v.name), solution.frame, _times(v.t_s, rate_hz, imus.get(v.name))) for v in solution.vehicles
+    ]
     pairs = [_pair_at(solution, p, imus, rate_hz) for p in solution.pairs]
     return replace(solution, vehicles=tuple(vehicles), pairs=tuple(pairs))
 
@@ -126,47 +129,99 @@ def _check_inside(name: str, state_s: Array, t_s: Array) -> None:
         raise InputError(f"{name}: the solution has no states to interpolate between")
     low, high = float(np.min(t_s)), float(np.max(t_s))
     if not (state_s[0] <= low and high <= state_s[-1]):  # NaN included
-        raise InputError(f"{name}: times from {low:g} s to {high:g} s are not within the solution, {state_s[0]:g} s to {state_s[-1]:g} s")
+        raise InputError(
+            f"{name}: times from {low:g} s to {high:g} s are not within the solution, {state_s[0]:g} s to {state_s[-1]:g} s"
+        )
+
+
+def _has_imu(vehicle: VehicleSolution, imu: ImuStream | None) -> BoolArray:
+    """States (K,) that have attitude and biases and no gap of the IMU's recording before the next state."""
+    if imu is None or not len(imu.t_s):
+        return np.zeros(len(vehicle.t_s), bool)
+    estimated = np.isfinite(np.hstack([vehicle.q_nb, vehicle.bias_gyro, vehicle.bias_accel])).all(axis=1)
+    ends = [[-np.inf, imu.t_s[0] - preintegration.GAP_S]], [[imu.t_s[-1] + preintegration.GAP_S, np.inf]]
+    gaps_s = np.vstack([ends[0], preintegration.gaps(imu), ends[1]])
+    following = np.append(vehicle.t_s[1:], vehicle.t_s[-1:])
+    return np.asarray(estimated & ~preintegration.crossing(gaps_s, vehicle.t_s, following))
 
 
 def _carried(
-    vehicle: VehicleSolution, R: Array, imu: ImuStream | None, frame: LocalFrame, k: IntArray, dt_s: Array
+    vehicle: VehicleSolution, R: Array, imu: ImuStream | None, has_imu: BoolArray, frame: LocalFrame, k: IntArray, dt_s: Array
 ) -> tuple[Array, Array, Array]:
     """r_p, v_p (n, 3) and R_p (n, 3, 3): states k (n,), sorted, carried forward by dt_s (n,)."""
-    r, v, dt = vehicle.r_n[k], vehicle.v_n[k], dt_s[:, None]
-    if imu is None:
-        return r + v * dt, v, R[k]
-    bias = np.hstack([vehicle.bias_gyro[k], vehicle.bias_accel[k]])
-    start = vehicle.t_s[k]
-    inc = preintegration.integrate(imu, start, start + dt_s, bias)
-    g = frame.gravity(r) - 2 * np.cross(frame.w_ie_n, v)
-    dp, dv = (np.squeeze(R[k] @ x[:, :, None], axis=2) for x in (inc.dp, inc.dv))
-    return r + v * dt + 0.5 * g * dt**2 + dp, v + g * dt + dv, exp_so3(-frame.w_ie_n * dt) @ R[k] @ inc.dR
+    r, v, C = vehicle.r_n[k] + vehicle.v_n[k] * dt_s[:, None], vehicle.v_n[k], R[k]
+    i = np.flatnonzero(has_imu[k])
+    if imu is None or not len(i):
+        return r, v, C
+    start, dt, C_k = vehicle.t_s[k[i]], dt_s[i, None], C[i]
+    inc = preintegration.integrate(imu, start, start + dt_s[i], np.hstack([vehicle.bias_gyro[k[i]], vehicle.bias_accel[k[i]]]))
+    g = frame.gravity(vehicle.r_n[k[i]]) - 2 * np.cross(frame.w_ie_n, v[i])
+    r[i] += 0.5 * g * dt**2 + _rotated(C_k, inc.dp)
+    v[i] += g * dt + _rotated(C_k, inc.dv)
+    C[i] = exp_so3(-frame.w_ie_n * dt) @ C_k @ inc.dR
+    return r, v, C
 
 
-def _missing(vehicle: VehicleSolution, R: Array, imu: ImuStream | None, frame: LocalFrame) -> tuple[Array, Array, Array, Array]:
+def _missing(
+    vehicle: VehicleSolution, R: Array, imu: ImuStream | None, has_imu: BoolArray, frame: LocalFrame
+) -> tuple[Array, Array, Array, Array]:
     """e_r, e_v, phi (K, 3) and T (K,) of the intervals after each state; the last state has none of it."""
     K = len(vehicle.t_s)
     e_r, e_v, phi, T = np.zeros((K, 3)), np.zeros((K, 3)), np.zeros((K, 3)), np.ones(K)
     if K > 1:
         T[:-1] = np.diff(vehicle.t_s)
-        r, v, C = _carried(vehicle, R, imu, frame, np.arange(K - 1), T[:-1])
+        r, v, C = _carried(vehicle, R, imu, has_imu, frame, np.arange(K - 1), T[:-1])
         e_r[:-1], e_v[:-1] = vehicle.r_n[1:] - r, vehicle.v_n[1:] - v
         phi[:-1] = log_so3(np.swapaxes(C, 1, 2) @ R[1:])
     return e_r, e_v, phi, T
 
 
-def _relative(a: Trajectory, b: Trajectory, frame: LocalFrame) -> PairTrajectory:
-    lat, lon, _ = geodetic_from_ecef(frame.to_ecef(a.r_n))
-    C = C_en(lat, lon) @ frame.C_en.T
-    baseline, velocity = (np.squeeze(C @ x[:, :, None], axis=2) for x in (b.r_n - a.r_n, b.v_n - a.v_n))
-    return PairTrajectory(a.t_s, baseline, velocity)
+def _rotated(C: Array, x: Array) -> Array:
+    """C x (n, 3) of rotations (n, 3, 3) and vectors (n, 3)."""
+    return np.asarray(np.squeeze(C @ x[:, :, None], axis=2))
 
 
 def _times(state_s: Array, rate_hz: float | None, imu: ImuStream | None) -> Array:
     """Times within the states: multiples of 1 / rate, else those of the IMU, else the states'."""
+    if not len(state_s) or (rate_hz is None and imu is None):
+        return state_s
+    first, last = state_s[0], state_s[-1]
     if rate_hz is None:
-        candidates = state_s if imu is None else imu.t_s
-    elif len(state_s):
-        candidates = np.arange(np.ceil(state_s[0] * rate_hz - 1e-6), np.floor(state_s[-1] * rate_hz + 1e-6) + 1) / rate_hz
-    ...
+        assert imu is not None
+        return np.asarray(imu.t_s[(imu.t_s >= first) & (imu.t_s <= last)])
+    # a state on a multiple counts although its time is rounded
+    n = np.arange(np.ceil(first * rate_hz - 1e-6), np.floor(last * rate_hz + 1e-6) + 1)
+    return np.clip(n / rate_hz, first, last)
+
+
+def _vehicle_at(vehicle: VehicleSolution, imu: ImuStream | None, frame: LocalFrame, t_s: Array) -> VehicleSolution:
+    found, k = interpolate(vehicle, imu, frame, t_s), earlier_state(vehicle.t_s, t_s)
+    return replace(
+        vehicle,
+        t_s=t_s,
+        r_n=found.r_n,
+        v_n=found.v_n,
+        q_nb=found.q_nb,
+        bias_gyro=vehicle.bias_gyro[k],
+        bias_accel=vehicle.bias_accel[k],
+        P=vehicle.P[k],
+    )
+
+
+def _pair_at(solution: Solution, pair: PairSolution, imus: dict[str, ImuStream | None], rate_hz: float | None) -> PairSolution:
+    a, b = imus.get(pair.reference), imus.get(pair.rover)
+    t_s = _times(pair.t_s, rate_hz, b if a is None else a)
+    found = interpolate_pair(solution.vehicle(pair.reference), solution.vehicle(pair.rover), a, b, solution.frame, t_s)
+    k = earlier_state(pair.t_s, t_s)
+    return replace(
+        pair,
+        t_s=t_s,
+        baseline_enu=found.baseline_enu,
+        velocity_enu=found.velocity_enu,
+        P=pair.P[k],
+        fix=pair.fix[k],
+        ratio=pair.ratio[k],
+        n_sat=pair.n_sat[k],
+        truth_enu=None,
+        truth_velocity_enu=None,
+    )

@@ -7,6 +7,7 @@ the best fit (Wahba's problem, by singular values) of
   - the body's forward axis <-> the direction of travel, weighted low, where the vehicle moves;
 
 so levelling, in-motion alignment and course are one estimate. A declared heading replaces what motion cannot tell.
+Windows end where IMU samples are missing.
 Source: Markley and Crassidis (2014), sec. 5.3; Wu and Pan (2013) for velocity-increment matching.
 """
 
@@ -18,7 +19,7 @@ from factorgraph.attitude import euler_from_matrix, matrix_from_euler
 from factorgraph.geodesy import LocalFrame
 from factorgraph.measurements import ImuStream
 from factorgraph.models import preintegration
-from factorgraph.types import Array
+from factorgraph.types import Array, BoolArray
 
 WINDOW_S = 10.0
 MOVING_MPS = 2.0
@@ -37,12 +38,18 @@ def rest_bias(imu: ImuStream, seconds: float = 2.0) -> Array:
     n = max(int(seconds / max(float(np.median(np.diff(imu.t_s))), 1e-4)), 10)
     for i in range(0, len(imu.t_s) - n, n):
         w, f = imu.w_b[i : i + n], imu.f_b[i : i + n]
-        if np.all(w.std(axis=0) < STATIC_RATE_RPS) and np.all(f.std(axis=0) < STATIC_FORCE_MPS2) and np.linalg.norm(w.mean(axis=0)) < 0.05:
+        if (
+            np.all(w.std(axis=0) < STATIC_RATE_RPS)
+            and np.all(f.std(axis=0) < STATIC_FORCE_MPS2)
+            and np.linalg.norm(w.mean(axis=0)) < 0.05
+        ):
             return np.asarray(w.mean(axis=0))
     return np.zeros(3)
 
 
-def align(imu: ImuStream, grid_s: Array, r_n: Array, v_n: Array, frame: LocalFrame, heading_rad: float | None) -> tuple[Array, Array]:
+def align(
+    imu: ImuStream, grid_s: Array, r_n: Array, v_n: Array, frame: LocalFrame, heading_rad: float | None
+) -> tuple[Array, Array]:
     """Attitude C_nb (K, 3, 3) at grid times and the gyroscope bias (3,) used.
 
     r_n, v_n (K, 3): positions and velocities good to metres and decimetres per second. `heading_rad`: heading at the
@@ -63,17 +70,22 @@ def align(imu: ImuStream, grid_s: Array, r_n: Array, v_n: Array, frame: LocalFra
     dv_n = np.diff(v_n, axis=0) - dt * 0.5 * ((gravity - coriolis)[1:] + (gravity - coriolis)[:-1])
     dv_b0 = np.einsum("kij,kj->ki", turn[:-1], inc.dv)
     middle = 0.5 * (grid_s[1:] + grid_s[:-1])
+    unknown = preintegration.crossing(preintegration.gaps(imu), grid_s[:-1], grid_s[1:])
+    stretch = np.concatenate([[0], np.cumsum(unknown)])
     speed = np.linalg.norm(v_n[:, :2], axis=1)
     forward_b0 = turn[:, :, 1]  # y is forward in RFU
     course_n = np.column_stack([v_n[:, 0], v_n[:, 1], np.zeros(K)]) / np.maximum(speed, 1e-6)[:, None]
     R = np.empty((K, 3, 3))
     told = np.zeros(K, bool)
     for k in range(K):
-        near = np.abs(middle - grid_s[k]) <= WINDOW_S
+        near = (np.abs(middle - grid_s[k]) <= WINDOW_S) & (stretch[:-1] == stretch[k]) & ~unknown
+        if k and unknown[k - 1] and not np.any(near):
+            R[k] = R[k - 1] @ inc.dR[k - 1]
+            continue
         if not np.any(near):
             near = np.abs(middle - grid_s[k]) <= np.min(np.abs(middle - grid_s[k])) + 1e-9
         B = dv_n[near].T @ dv_b0[near]
-        moving = (np.abs(grid_s - grid_s[k]) <= WINDOW_S) & (speed > MOVING_MPS)
+        moving = (np.abs(grid_s - grid_s[k]) <= WINDOW_S) & (speed > MOVING_MPS) & (stretch == stretch[k])
         # one course direction weighs like half a metre per second of velocity change
         B += 0.25 * course_n[moving].T @ forward_b0[moving]
         horizontal = dv_n[near][:, :2]
@@ -85,7 +97,7 @@ def align(imu: ImuStream, grid_s: Array, r_n: Array, v_n: Array, frame: LocalFra
     return R, bias[0, :3]
 
 
-def _apply_heading(R: Array, turn: Array, told: Array, heading_rad: float) -> Array:
+def _apply_heading(R: Array, turn: Array, told: BoolArray, heading_rad: float) -> Array:
     """States whose heading nothing tells take it from the declared heading of state 0, carried by the gyroscope."""
     pitch, roll, _ = euler_from_matrix(R)
     start = matrix_from_euler(float(pitch[0]), float(roll[0]), heading_rad)

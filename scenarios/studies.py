@@ -16,8 +16,8 @@ import numpy as np
 
 from factorgraph import registry
 from factorgraph.solution import Fix, Solution
-from factorgraph.types import Array
-from scenarios.simulate import SimulatedFlight, load_scenario, simulate
+from factorgraph.types import Array, IntArray
+from scenarios.simulate import Scenario, SimulatedFlight, load_scenario, simulate
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class Trial:
     error_enu: Array  # (K, 3) baseline, estimate minus truth
     nees: Array  # (K,) of the baseline
     bound_m2: Array  # (K,) trace of the posterior Cramer-Rao bound of the baseline, integers known
-    fix: Array  # (K,) values of Fix
+    fix: IntArray  # (K,) values of Fix
     wrong_epochs: int  # epochs whose integers in use contain a wrong one
     status: str
     runtime_s: float
@@ -66,7 +66,14 @@ class Consistency:
         return np.asarray(np.sum([t.nees[k] for t in self.trials], axis=0))
 
 
-def run(scenario: str, seeds: Sequence[int], method: str = "graph", workers: int = 1, progress: Callable[[int], None] | None = None, duration_s: float | None = None) -> Consistency:
+def run(
+    scenario: str,
+    seeds: Sequence[int],
+    method: str = "graph",
+    workers: int = 1,
+    progress: Callable[[int], None] | None = None,
+    duration_s: float | None = None,
+) -> Consistency:
     """Simulate and solve one flight per seed. `duration_s` shortens the scenario; `progress` hears of finished trials."""
     one = partial(trial, scenario, method, duration_s)
     done: list[Trial] = []
@@ -111,7 +118,7 @@ def trial(scenario: str, method: str, duration_s: float | None, seed: int) -> Tr
     )
 
 
-def replace_duration(description, duration_s: float):  # type: ignore[no-untyped-def]
+def replace_duration(description: Scenario, duration_s: float) -> Scenario:
     """The same scenario, shorter or longer."""
     return description.model_copy(update={"scenario": description.scenario.model_copy(update={"duration_s": duration_s})})
 
@@ -130,7 +137,8 @@ def wrong_epochs(flight: SimulatedFlight, solution: Solution) -> int:
         s = antenna.stream
         integer = flight.record.gnss[name].integer
         number[name] = {
-            (s.satellites[a], s.signals[g], round(float(s.t_s[e]))): int(n) for a, g, e, n in zip(s.sat, s.signal, s.epoch, integer, strict=True)
+            (s.satellites[a], s.signals[g], round(float(s.t_s[e]))): int(n)
+            for a, g, e, n in zip(s.sat, s.signal, s.epoch, integer, strict=True)
         }
     wrong = set()
     epochs = np.round(pair.t_s).astype(int)
@@ -147,4 +155,3 @@ def wrong_epochs(flight: SimulatedFlight, solution: Solution) -> int:
             if len(deviations) > 1:
                 wrong.add(int(t))
     return len(wrong)
-

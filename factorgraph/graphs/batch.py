@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph import start
-from factorgraph.errors import InputError
 from factorgraph.graphs import integers
 from factorgraph.graphs.build import Built, Receiver, build, native_factors, receivers
 from factorgraph.graphs.optimizer import Graph, Result, optimise
@@ -55,16 +54,28 @@ class Batch:
         clock.stage("done", 1.0)
         return solution
 
-    def _start(self, problem: NavigationProblem, vehicles: list[VehicleVariables], rx: dict[str, Receiver], grid: Array) -> list[str]:
+    def _start(
+        self, problem: NavigationProblem, vehicles: list[VehicleVariables], rx: dict[str, Receiver], grid: Array
+    ) -> list[str]:
         """Positions, velocities and attitudes into `vehicles`, by way of a graph without IMU."""
         rough = [
-            VehicleVariables(v.index, replace(v.vehicle, motion=START_MOTION) if v.vehicle.imu is not None else v.vehicle, grid, problem.frame, use_imu=False)
+            VehicleVariables(
+                v.index,
+                replace(v.vehicle, motion=START_MOTION) if v.vehicle.imu is not None else v.vehicle,
+                grid,
+                problem.frame,
+                use_imu=False,
+            )
             for v in vehicles
         ]
         notes = []
         known = [self._start_positions(problem, v, rx, grid) for v in rough]
         anchors = [t.position_n for m in problem.ranges for t in m.stream.tags if t.position_n is not None]
-        fallback = np.mean(anchors, axis=0) if anchors else np.mean([v.r.mean(axis=0) for v, k in zip(rough, known, strict=True) if k] or [np.zeros(3)], axis=0)
+        fallback = (
+            np.mean(anchors, axis=0)
+            if anchors
+            else np.mean([v.r.mean(axis=0) for v, k in zip(rough, known, strict=True) if k] or [np.zeros(3)], axis=0)
+        )
         rng = np.random.default_rng(0)
         for v, is_known in zip(rough, known, strict=True):
             if not is_known:
@@ -100,7 +111,7 @@ class Batch:
             p = v.vehicle.positions[0]
             v.r = start.interpolate(grid, p.t_s, p.r_n)
             if len(grid) > 1:
-                v.v = np.gradient(v.r, grid, axis=0)
+                v.v = np.asarray(np.gradient(v.r, grid, axis=0))
             return True
         return False
 
@@ -138,7 +149,11 @@ class Batch:
         for _ in range(5):
             result = optimise(graph, problem.settings.robust, problem.settings.max_iterations, ROUGH, clock.iteration)
             costs += result.costs
-            moved = [v for v in graph.vehicles if v.mode == "imu" and np.any(np.abs(v.bias - v.preintegrated_bias).max(axis=0) > REBIAS)]
+            moved = [
+                v
+                for v in graph.vehicles
+                if v.mode == "imu" and np.any(np.abs(v.bias - v.preintegrated_bias).max(axis=0) > REBIAS)
+            ]
             if not moved or result.status is not Status.CONVERGED:
                 break
             native_factors(graph)
@@ -147,7 +162,9 @@ class Batch:
             graph.assemble()
         return Result(result.status, costs, result.bayes_net)
 
-    def _continue(self, problem: NavigationProblem, graph: Graph, before: Result, clock: _Clock, tolerance: float = ROUGH) -> Result:
+    def _continue(
+        self, problem: NavigationProblem, graph: Graph, before: Result, clock: _Clock, tolerance: float = ROUGH
+    ) -> Result:
         graph.assemble()
         result = optimise(graph, problem.settings.robust, problem.settings.max_iterations, tolerance, clock.iteration)
         return Result(result.status, before.costs + result.costs, result.bayes_net)

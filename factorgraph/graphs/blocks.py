@@ -260,6 +260,7 @@ class RangeBlock(Block):
             pb = self.b.vehicle.points(self.b.query)
             d, others = pa.r_n - pb.r_n, [-pb.J_r]
         else:
+            assert self.anchor_n is not None
             d, others = pa.r_n - self.anchor_n, []
         rho = np.maximum(np.linalg.norm(d, axis=1), 1e-6)
         e = d / rho[:, None]
@@ -365,7 +366,9 @@ class GnssBlock(Block):
     iono_scale: Array = field(init=False)  # (n,) metres of this row per metre of it
     iono_key: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     iono_value: Array = field(default_factory=lambda: np.zeros(0))  # vertical at L1, rover minus reference [m]
-    scalar_cache: dict[int, tuple[list[int], Array]] = field(default_factory=dict)  # structure of each factor, until factors are renewed
+    scalar_cache: dict[int, tuple[list[int], Array]] = field(
+        default_factory=dict
+    )  # structure of each factor, until factors are renewed
 
     def __post_init__(self) -> None:
         Block.__post_init__(self)

@@ -34,10 +34,21 @@ from factorgraph.graphs.blocks import (
 from factorgraph.graphs.inertial import add_imu_factors, add_priors, motion_keys, motion_prior_rows
 from factorgraph.graphs.optimizer import Graph
 from factorgraph.graphs.variables import VehicleVariables
-from factorgraph.models.arcs import find_arcs
+from factorgraph.models.arcs import Arcs, find_arcs
 from factorgraph.models.differencing import CommonGroups
-from factorgraph.models.gnss import WAVELENGTH_L1_M, Prepared, SinglePoint, elevation_scale, one_code_per_satellite, pair_rows, prepare, single_point, system_of
-from factorgraph.problem import Link, NavigationProblem, RangeModel, Vehicle
+from factorgraph.models.gnss import (
+    WAVELENGTH_L1_M,
+    PairedRows,
+    Prepared,
+    SinglePoint,
+    elevation_scale,
+    one_code_per_satellite,
+    pair_rows,
+    prepare,
+    single_point,
+    system_of,
+)
+from factorgraph.problem import Antenna, Link, NavigationProblem, RangeModel, Vec3, Vehicle
 from factorgraph.start import interpolate
 from factorgraph.types import Array, BoolArray, IntArray
 
@@ -55,6 +66,16 @@ class Receiver:
     prepared: Prepared
     usable: BoolArray  # (n,) rows above the mask, strong enough, with a satellite state
 
+    @property
+    def antenna(self) -> Antenna:
+        assert self.vehicle.gnss is not None
+        return self.vehicle.gnss
+
+    @property
+    def lever_b(self) -> Vec3:
+        """Lever arm from the vehicle's own point; a base station's point is its antenna."""
+        return (0.0, 0.0, 0.0) if self.vehicle.is_fixed else self.antenna.lever_b
+
 
 @dataclass(slots=True)
 class GnssLink:
@@ -67,7 +88,7 @@ class GnssLink:
     arc_signal: list[str]
     arc_start_s: Array
     arc_end_s: Array
-    state: list[str] = field(default_factory=list)  # per arc: "float", "fixed", "released", "datum", "unused"
+    state: list[str] = field(default_factory=list)  # per arc: "float", "fixed", "released", "datum"
     slips: dict[str, int] = field(default_factory=dict)
     key_base: int = 0
     float_cyc: Array = field(default_factory=lambda: np.zeros(0))  # before fixing
@@ -90,7 +111,9 @@ def receivers(problem: NavigationProblem) -> dict[str, Receiver]:
             continue
         stream, noise = v.gnss.stream, v.gnss.noise
         if not np.any(np.isfinite(stream.sat_pos_ecef)):
-            raise InputError(f"vehicle {v.name}: no satellite has an ephemeris; check that the navigation file covers the flight's time")
+            raise InputError(
+                f"vehicle {v.name}: no satellite has an ephemeris; check that the navigation file covers the flight's time"
+            )
         klobuchar = stream.klobuchar if settings.ionosphere_model == "broadcast" else None
         point = single_point(stream, noise, settings.systems, klobuchar, problem.t0.sow)
         good = np.isfinite(point.clock_s)
@@ -140,59 +163,36 @@ def _gnss_rows(
 
 def _without_singles(order: IntArray, clock_label: IntArray) -> IntArray:
     """Rows of `order` whose clock group has at least two rows; a single row only serves its own clock."""
-    labels, inverse, count = np.unique(clock_label[order], return_inverse=True, return_counts=True)
+    _, inverse, count = np.unique(clock_label[order], return_inverse=True, return_counts=True)
     return order[count[inverse] > 1]
 
 
-def link_block(problem: NavigationProblem, link: Link, ends: dict[str, VehicleVariables], rx: dict[str, Receiver], key_base: int, use_phase: bool) -> GnssLink:
+def link_block(
+    problem: NavigationProblem,
+    link: Link,
+    ends: dict[str, VehicleVariables],
+    rx: dict[str, Receiver],
+    key_base: int,
+    use_phase: bool,
+) -> GnssLink:
     """Differences rover - reference of code, phase and Doppler. Raises InputError when the two share nothing."""
     ref, rov = rx[link.reference], rx[link.rover]
-    a, b = ref.vehicle.gnss, rov.vehicle.gnss
-    assert a is not None and b is not None
-    settings = problem.settings
-    pairs = pair_rows(a.stream, b.stream, ref.usable, rov.usable, settings.bands)
+    a, b = ref.antenna, rov.antenna
+    pairs = pair_rows(a.stream, b.stream, ref.usable, rov.usable, problem.settings.bands)
     grid = ends[link.rover].t_s
     inside = (b.stream.t_s[pairs.epoch] >= grid[0] - 0.01) & (b.stream.t_s[pairs.epoch] <= grid[-1] + 0.01)
     if not np.any(inside):
-        common = set(a.stream.satellites) & set(b.stream.satellites)
-        raise InputError(
-            f"link {link.reference}-{link.rover}: "
-            + ("no common satellites" if not common else "no common epochs" if not len(pairs.a) else "no common usable observations")
-            + f" ({link.reference} {a.stream.t_s[0]:.1f} to {a.stream.t_s[-1]:.1f} s, {link.rover} {b.stream.t_s[0]:.1f} to {b.stream.t_s[-1]:.1f} s)"
-        )
-    ra, rb = pairs.a, pairs.b
-    lam = b.stream.wavelength_m[rb]
-    glonass = np.char.startswith(np.array(b.stream.satellites)[b.stream.sat[rb]], "R")
-    half = ((a.stream.lli[ra] | b.stream.lli[rb]) & 2) > 0
-    has_phase = np.isfinite(a.stream.phase_cyc[ra]) & np.isfinite(b.stream.phase_cyc[rb]) & ~glonass & ~half & inside & use_phase
-    arcs = find_arcs(a.stream, b.stream, pairs, has_phase, settings.ambiguity)
-    length = np.bincount(arcs.of_row[arcs.of_row >= 0], minlength=arcs.count + 1)
-    arc = np.where((arcs.of_row >= 0) & (length[arcs.of_row] >= settings.ambiguity.min_arc_epochs), arcs.of_row, -1)
-    observed = {
-        CODE: (inside & np.isfinite(a.stream.code_m[ra]) & np.isfinite(b.stream.code_m[rb]), rov.prepared.code_m[rb] - ref.prepared.code_m[ra]),
-        PHASE: (arc >= 0, rov.prepared.phase_m[rb] - ref.prepared.phase_m[ra]),
-        DOPPLER: (
-            inside & np.isfinite(ref.prepared.rate_mps[ra]) & np.isfinite(rov.prepared.rate_mps[rb]) & np.all(np.isfinite(rov.prepared.sat_vel_n[rb]), axis=1),
-            rov.prepared.rate_mps[rb] - ref.prepared.rate_mps[ra],
-        ),
-    }
-    scale_a, scale_b = elevation_scale(ref.prepared.elevation_rad[ra]), elevation_scale(rov.prepared.elevation_rad[rb])
-    spread = {CODE: (a.noise.code_m, b.noise.code_m), PHASE: (a.noise.phase_m, b.noise.phase_m), DOPPLER: (a.noise.doppler_mps, b.noise.doppler_mps)}
-    parts = [(np.flatnonzero(use), np.full(int(use.sum()), kind), z[use]) for kind, (use, z) in observed.items()]
-    row, kind, z = (np.concatenate([p[i] for p in parts]) for i in range(3))
-    sigma = np.zeros(len(row))
-    for k, (sa, sb) in spread.items():
-        mine = kind == k
-        sigma[mine] = np.hypot(sa * scale_a[row[mine]], sb * scale_b[row[mine]])
+        raise InputError(_nothing_shared(link, a, b, bool(len(pairs.a))))
+    arcs, arc = _phase_arcs(problem, a, b, pairs, inside & use_phase)
+    row, kind, z, sigma = _differences(ref, rov, pairs, inside, arc)
     # one clock per kind, signal pair and constellation: the signal pair's name begins with the constellation
-    order = np.lexsort((b.stream.sat[rb[row]], pairs.group[row], kind, pairs.epoch[row]))
+    order = np.lexsort((b.stream.sat[pairs.b[row]], pairs.group[row], kind, pairs.epoch[row]))
     order = _without_singles(order, (pairs.epoch[row] * 3 + kind) * len(pairs.group_names) + pairs.group[row])
     row, kind, z, sigma = row[order], kind[order], z[order], sigma[order]
-    epoch, factor_of = np.unique(pairs.epoch[row], return_inverse=True)
-    first = np.concatenate([[0], np.flatnonzero(np.diff(factor_of)) + 1]) if len(row) else np.zeros(0, np.int64)
-    t_rover, t_ref = rov.prepared.t_s[rb[row[first]]], ref.prepared.t_s[ra[row[first]]]
-    rover = Endpoint(ends[link.rover], ends[link.rover].query(t_rover, b.lever_b))
-    reference = Endpoint(ends[link.reference], ends[link.reference].query(t_ref, a.lever_b if not ref.vehicle.is_fixed else (0.0, 0.0, 0.0)))
+    ra, rb = pairs.a[row], pairs.b[row]
+    _, factor_of = np.unique(pairs.epoch[row], return_inverse=True)
+    first = CommonGroups.from_labels(factor_of).start
+    t_rover, t_ref = rov.prepared.t_s[rb[first]], ref.prepared.t_s[ra[first]]
     rows = _gnss_rows(
         kind,
         pairs.group[row],
@@ -200,31 +200,77 @@ def link_block(problem: NavigationProblem, link: Link, ends: dict[str, VehicleVa
         t_rover[factor_of],
         sigma,
         label=list(b.stream.satellites),
-        label_index=b.stream.sat[rb[row]],
+        label_index=b.stream.sat[rb],
         source=f"{link.reference}-{link.rover}",
         group=list(pairs.group_names),
-        azimuth_rad=rov.prepared.azimuth_rad[rb[row]],
-        elevation_rad=rov.prepared.elevation_rad[rb[row]],
+        azimuth_rad=rov.prepared.azimuth_rad[rb],
+        elevation_rad=rov.prepared.elevation_rad[rb],
     )
-    used, arc_of = np.unique(arc[row][kind == PHASE], return_inverse=True)
     arc_row = np.full(len(row), -1, np.int64)
-    arc_row[kind == PHASE] = arc_of
+    arc_row[kind == PHASE] = np.unique(arc[row][kind == PHASE], return_inverse=True)[1]
     block = GnssBlock(
         rows,
-        rover=rover,
-        reference=reference,
+        rover=Endpoint(ends[link.rover], ends[link.rover].query(t_rover, rov.lever_b)),
+        reference=Endpoint(ends[link.reference], ends[link.reference].query(t_ref, ref.lever_b)),
         point_rover=factor_of,
         z=z,
-        sat_rover=rov.prepared.sat_n[rb[row]],
-        vel_rover=np.nan_to_num(rov.prepared.sat_vel_n[rb[row]]),
-        sat_reference=ref.prepared.sat_n[ra[row]],
-        vel_reference=np.nan_to_num(ref.prepared.sat_vel_n[ra[row]]),
-        wavelength_m=lam[row],
+        sat_rover=rov.prepared.sat_n[rb],
+        vel_rover=np.nan_to_num(rov.prepared.sat_vel_n[rb]),
+        sat_reference=ref.prepared.sat_n[ra],
+        vel_reference=np.nan_to_num(ref.prepared.sat_vel_n[ra]),
+        wavelength_m=b.stream.wavelength_m[rb],
         arc=arc_row,
     )
-    link_data = GnssLink(link, block, np.zeros(0, np.int64), [], [], np.zeros(0), np.zeros(0), slips=arcs.slips, key_base=key_base)
-    describe_arcs(link_data)
-    return link_data
+    data = GnssLink(link, block, np.zeros(0, np.int64), [], [], np.zeros(0), np.zeros(0), slips=arcs.slips, key_base=key_base)
+    describe_arcs(data)
+    return data
+
+
+def _nothing_shared(link: Link, a: Antenna, b: Antenna, have_rows: bool) -> str:
+    common = set(a.stream.satellites) & set(b.stream.satellites)
+    what = (
+        "no common satellites"
+        if not common
+        else "no common usable observations inside the flight"
+        if have_rows
+        else "no common epochs"
+    )
+    spans = [f"{name} {x.stream.t_s[0]:.1f} to {x.stream.t_s[-1]:.1f} s" for name, x in ((link.reference, a), (link.rover, b))]
+    return f"link {link.reference}-{link.rover}: {what} ({', '.join(spans)} after t0); check that the files are of one flight"
+
+
+def _phase_arcs(
+    problem: NavigationProblem, a: Antenna, b: Antenna, pairs: PairedRows, wanted: BoolArray
+) -> tuple[Arcs, IntArray]:
+    """Arcs of the paired rows, and per row its arc or -1 where the phase is missing, unfit for integers or the arc too short."""
+    settings = problem.settings.ambiguity
+    glonass = np.char.startswith(np.array(b.stream.satellites)[b.stream.sat[pairs.b]], "R")
+    half_cycle = ((a.stream.lli[pairs.a] | b.stream.lli[pairs.b]) & 2) > 0
+    finite = np.isfinite(a.stream.phase_cyc[pairs.a]) & np.isfinite(b.stream.phase_cyc[pairs.b])
+    arcs = find_arcs(a.stream, b.stream, pairs, finite & ~glonass & ~half_cycle & wanted, settings)
+    length = np.bincount(arcs.of_row[arcs.of_row >= 0], minlength=arcs.count + 1)
+    return arcs, np.where((arcs.of_row >= 0) & (length[arcs.of_row] >= settings.min_arc_epochs), arcs.of_row, -1)
+
+
+def _differences(
+    ref: Receiver, rov: Receiver, pairs: PairedRows, inside: BoolArray, arc: IntArray
+) -> tuple[IntArray, IntArray, Array, Array]:
+    """Paired row, kind, difference and standard deviation of every usable observation, kinds one after the other."""
+    ra, rb = pairs.a, pairs.b
+    scale_a, scale_b = elevation_scale(ref.prepared.elevation_rad[ra]), elevation_scale(rov.prepared.elevation_rad[rb])
+    na, nb = ref.antenna.noise, rov.antenna.noise
+    moving = np.all(np.isfinite(rov.prepared.sat_vel_n[rb]), axis=1)
+    parts = []
+    for kind, name, sigma_a, sigma_b in (
+        (CODE, "code_m", na.code_m, nb.code_m),
+        (PHASE, "phase_m", na.phase_m, nb.phase_m),
+        (DOPPLER, "rate_mps", na.doppler_mps, nb.doppler_mps),
+    ):
+        z = getattr(rov.prepared, name)[rb] - getattr(ref.prepared, name)[ra]
+        use = np.flatnonzero(arc >= 0 if kind == PHASE else inside & np.isfinite(z) & (moving | (kind == CODE)))
+        parts.append((use, np.full(len(use), kind), z[use], np.hypot(sigma_a * scale_a, sigma_b * scale_b)[use]))
+    row, kinds, z, sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return row, kinds, z, sigma
 
 
 def describe_arcs(data: GnssLink) -> None:
@@ -244,20 +290,19 @@ def describe_arcs(data: GnssLink) -> None:
     data.state = ["float"] * n
 
 
-def absolute_block(problem: NavigationProblem, name: str, ends: dict[str, VehicleVariables], rx: Receiver, with_code: bool) -> GnssBlock | None:
+def absolute_block(problem: NavigationProblem, end: VehicleVariables, rx: Receiver) -> GnssBlock | None:
     """Undifferenced code (one signal per satellite) and Doppler of a moving receiver."""
-    antenna = rx.vehicle.gnss
-    assert antenna is not None
+    antenna = rx.antenna
     stream, noise = antenna.stream, antenna.noise
-    grid = ends[name].t_s
+    grid = end.t_s
     rows = one_code_per_satellite(stream, rx.usable)
     t = rx.prepared.t_s[rows]
     rows = rows[(t >= grid[0] - 0.01) & (t <= grid[-1] + 0.01)]
     rate_ok = np.isfinite(rx.prepared.rate_mps[rows]) & np.all(np.isfinite(rx.prepared.sat_vel_n[rows]), axis=1)
-    parts = []
-    if with_code:
-        parts.append((rows, np.full(len(rows), CODE), rx.prepared.code_m[rows]))
-    parts.append((rows[rate_ok], np.full(int(rate_ok.sum()), DOPPLER), rx.prepared.rate_mps[rows[rate_ok]]))
+    parts = [
+        (rows, np.full(len(rows), CODE), rx.prepared.code_m[rows]),
+        (rows[rate_ok], np.full(int(rate_ok.sum()), DOPPLER), rx.prepared.rate_mps[rows[rate_ok]]),
+    ]
     row, kind, z = (np.concatenate([p[i] for p in parts]) for i in range(3))
     letters, system = np.unique(system_of(stream)[row], return_inverse=True)
     order = np.lexsort((stream.sat[row], system, kind, stream.epoch[row]))
@@ -280,7 +325,7 @@ def absolute_block(problem: NavigationProblem, name: str, ends: dict[str, Vehicl
         sigma,
         label=list(stream.satellites),
         label_index=stream.sat[row],
-        source=name,
+        source=end.name,
         group=[str(s) for s in letters],
         azimuth_rad=rx.prepared.azimuth_rad[row],
         elevation_rad=rx.prepared.elevation_rad[row],
@@ -288,7 +333,7 @@ def absolute_block(problem: NavigationProblem, name: str, ends: dict[str, Vehicl
     zero = np.zeros((len(row), 3))
     return GnssBlock(
         table,
-        rover=Endpoint(ends[name], ends[name].query(times, antenna.lever_b)),
+        rover=Endpoint(end, end.query(times, antenna.lever_b)),
         reference=None,
         point_rover=factor_of,
         z=z,
@@ -301,11 +346,24 @@ def absolute_block(problem: NavigationProblem, name: str, ends: dict[str, Vehicl
     )
 
 
-def _plain_rows(kind: int, t: Array, sigma: Array, factor: IntArray, source: str, label: list[str], label_index: IntArray) -> Rows:
+def _plain_rows(
+    kind: int, t: Array, sigma: Array, factor: IntArray, source: str, label: list[str], label_index: IntArray
+) -> Rows:
     nothing = np.full(len(t), np.nan)
     zeros = np.zeros(len(t), np.int64)
     return Rows(
-        np.full(len(t), kind), t, sigma, CommonGroups.from_labels(factor), None, source, label, label_index, [""], zeros, nothing, nothing
+        np.full(len(t), kind),
+        t,
+        sigma,
+        CommonGroups.from_labels(factor),
+        None,
+        source,
+        label,
+        label_index,
+        [""],
+        zeros,
+        nothing,
+        nothing,
     )
 
 
@@ -313,22 +371,32 @@ def _in_grid(t: Array, grid: Array) -> BoolArray:
     return np.asarray((t >= grid[0] - 1e-6) & (t <= grid[-1] + 1e-6))
 
 
-def position_blocks(vehicle: Vehicle, end: VehicleVariables) -> list[Block]:
+def position_blocks(end: VehicleVariables) -> list[Block]:
+    """Position fixes and heights of a vehicle."""
+    vehicle = end.vehicle
     blocks: list[Block] = []
     for p in vehicle.positions:
-        ok = _in_grid(p.t_s, end.t_s) & np.all(np.isfinite(p.r_n), axis=1)
+        ok = _in_grid(p.t_s, end.t_s) & np.all(np.isfinite(p.r_n), axis=1) & end.is_carried(p.t_s)
         n = int(ok.sum())
         if n:
             rows = _plain_rows(
-                POSITION, np.repeat(p.t_s[ok], 3), p.sigma_m[ok].ravel(), np.repeat(np.arange(n), 3), f"{vehicle.name}/{p.name}", ["E", "N", "U"], np.tile(np.arange(3), n)
+                POSITION,
+                np.repeat(p.t_s[ok], 3),
+                p.sigma_m[ok].ravel(),
+                np.repeat(np.arange(n), 3),
+                f"{vehicle.name}/{p.name}",
+                ["E", "N", "U"],
+                np.tile(np.arange(3), n),
             )
             blocks.append(PositionBlock(rows, end=Endpoint(end, end.query(p.t_s[ok], p.lever_b)), z_n=p.r_n[ok]))
     for h in vehicle.heights:
-        ok = _in_grid(h.t_s, end.t_s) & np.isfinite(h.up_m)
+        ok = _in_grid(h.t_s, end.t_s) & np.isfinite(h.up_m) & end.is_carried(h.t_s)
         n = int(ok.sum())
         if n:
             query = end.query(h.t_s[ok], h.lever_b)
-            rows = _plain_rows(HEIGHT, h.t_s[ok], h.sigma_m[ok], query.k, f"{vehicle.name}/{h.name}", ["U"], np.zeros(n, np.int64))
+            rows = _plain_rows(
+                HEIGHT, h.t_s[ok], h.sigma_m[ok], query.k, f"{vehicle.name}/{h.name}", ["U"], np.zeros(n, np.int64)
+            )
             blocks.append(HeightBlock(rows, end=Endpoint(end, query), z_m=h.up_m[ok]))
     return blocks
 
@@ -348,11 +416,15 @@ def range_blocks(model: RangeModel, ends: dict[str, VehicleVariables], first_par
     lever = np.array([tag.lever_b for tag in tags])
     anchor = np.array([tag.position_n or (np.nan,) * 3 for tag in tags])
     pair = np.char.add(np.char.add(carrier[a], "\n"), carrier[b])
+    for name, end in ends.items():
+        ok &= ((carrier[a] != name) & (carrier[b] != name)) | end.is_carried(stream.t_s)
     for name in np.unique(pair[ok]):
         rows = np.flatnonzero(ok & (pair == name))
         va, vb = str(name).split("\n")
         t = stream.t_s[rows]
-        labels, index = np.unique([f"{tags[i].name}-{tags[j].name}" for i, j in zip(a[rows], b[rows], strict=True)], return_inverse=True)
+        labels, index = np.unique(
+            [f"{tags[i].name}-{tags[j].name}" for i, j in zip(a[rows], b[rows], strict=True)], return_inverse=True
+        )
         query = ends[va].query(t, lever[a[rows]])
         other = Endpoint(ends[vb], ends[vb].query(t, lever[b[rows]])) if vb else None
         interval = query.k if other is None else query.k * len(grid) + other.query.k
@@ -378,7 +450,15 @@ def range_blocks(model: RangeModel, ends: dict[str, VehicleVariables], first_par
 def motion_block(vehicle: VehicleVariables) -> MotionBlock:
     L, J = motion_prior_rows(vehicle)
     n = len(L)
-    rows = _plain_rows(-1, np.repeat(vehicle.t_s[1:], 6), np.ones(6 * n), np.repeat(np.arange(n), 6), vehicle.name, ["motion"], np.zeros(6 * n, np.int64))
+    rows = _plain_rows(
+        -1,
+        np.repeat(vehicle.t_s[1:], 6),
+        np.ones(6 * n),
+        np.repeat(np.arange(n), 6),
+        vehicle.name,
+        ["motion"],
+        np.zeros(6 * n, np.int64),
+    )
     return MotionBlock(rows, vehicle=vehicle, keys_of=[motion_keys(vehicle, k) for k in range(n)], L=L, J0=J)
 
 
@@ -415,7 +495,15 @@ def add_ionosphere(problem: NavigationProblem, data: GnssLink, baseline_m: float
     gap_s = np.concatenate([[0], np.diff(at)]) * settings.ionosphere_step_s
     sigmas = np.where(follows, sigma * np.sqrt(np.maximum(gap_s, 1.0) / settings.ionosphere_correlation_s), sigma)
     n = len(used)
-    table = _plain_rows(-1, rows.t_s[0] + at * settings.ionosphere_step_s, sigmas, np.arange(n), rows.source, ["ionosphere"], np.zeros(n, np.int64))
+    table = _plain_rows(
+        -1,
+        rows.t_s[0] + at * settings.ionosphere_step_s,
+        sigmas,
+        np.arange(n),
+        rows.source,
+        ["ionosphere"],
+        np.zeros(n, np.int64),
+    )
     return IonosphereBlock(table, of=block, previous=np.where(follows, np.arange(n) - 1, -1))
 
 
@@ -444,7 +532,11 @@ def native_factors(graph: Graph) -> None:
 
 
 def build(
-    problem: NavigationProblem, vehicles: list[VehicleVariables], rx: dict[str, Receiver], use_phase: bool, progress: Callable[[float], None] = lambda f: None
+    problem: NavigationProblem,
+    vehicles: list[VehicleVariables],
+    rx: dict[str, Receiver],
+    use_phase: bool,
+    progress: Callable[[float], None] = lambda f: None,
 ) -> Built:
     """All blocks and native factors for variables that already hold start values."""
     ends = {v.name: v for v in vehicles}
@@ -464,17 +556,17 @@ def build(
             if ionosphere is not None:
                 absolute.append(ionosphere)
     for v in problem.vehicles:
-        if v.name in rx and not v.is_fixed and problem.settings.use_absolute and not v.positions:
-            block = absolute_block(problem, v.name, ends, rx[v.name], with_code=v.name not in rovers)
-            if block is not None and v.name not in rovers:
+        if v.name in rx and v.name not in rovers and not v.is_fixed and problem.settings.use_absolute and not v.positions:
+            block = absolute_block(problem, ends[v.name], rx[v.name])
+            if block is not None:
                 absolute.append(block)
     for i, model in enumerate(problem.ranges):
         graph.ranges += range_blocks(model, ends, i * 10_000)
     others: list[Block] = []
-    for v in vehicles:
-        others += position_blocks(v.vehicle, v)
-        if v.mode == "motion":
-            others.append(motion_block(v))
+    for end in vehicles:
+        others += position_blocks(end)
+        if end.mode == "motion":
+            others.append(motion_block(end))
     for pair in problem.wanted_pairs:
         both = [ends[pair.reference], ends[pair.rover]]
         if all(end.mode != "fixed" for end in both):

@@ -93,7 +93,9 @@ def _joints(groups, dim, node_of, row_of, var_first, var, size, out, out_first, 
             j = 0
             for q in range(groups.shape[1]):
                 if q >= p:
-                    _fetch(groups[g, p], groups[g, q], dim, node_of, row_of, var_first, var, size, out, out_first, target[g], i, j)
+                    _fetch(
+                        groups[g, p], groups[g, q], dim, node_of, row_of, var_first, var, size, out, out_first, target[g], i, j
+                    )
                 j += dim[groups[g, q]]
             i += dim[groups[g, p]]
         for a in range(i):
@@ -155,7 +157,15 @@ class JointCovariance:
         self.size = np.array(size, np.int64)
         self.out = np.zeros(self.out_first[-1])
         _selected_inverse(
-            self.dim, self.node_of, self.row_of, self.var_first, self.var, self.size, np.concatenate(blocks), self.out, self.out_first
+            self.dim,
+            self.node_of,
+            self.row_of,
+            self.var_first,
+            self.var,
+            self.size,
+            np.concatenate(blocks),
+            self.out,
+            self.out_first,
         )
 
     def block(self, a: int, b: int) -> Array:

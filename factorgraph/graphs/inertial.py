@@ -3,6 +3,8 @@
 GTSAM adds Coriolis and centrifugal terms of the position relative to the frame's origin; gravity of every interval is
 therefore gravitation at its middle plus the centrifugal acceleration of the origin.
 
+An interval that IMU samples are missing from keeps its factor, with noise that leaves the vehicle all but free.
+
 The motion prior is white noise on acceleration (constant velocity in the mean), exact between states:
 
     r_1 - r_0 - v_0 dt ~ , v_1 - v_0 ~ N(0, q [dt^3/3 dt^2/2; dt^2/2 dt]).   Source: Barfoot (2017), sec. 3.4.
@@ -14,9 +16,10 @@ import gtsam
 import numpy as np
 
 from factorgraph.graphs.variables import VehicleVariables, key
-from factorgraph.models.preintegration import gtsam_inputs
+from factorgraph.models.preintegration import crossing, gtsam_inputs
 from factorgraph.types import Array
 
+GAP_GYRO, GAP_ACCEL = 1.0, 10.0  # rad/s and m/s^2 per sqrt(Hz)
 INTEGRATION_SIGMA_M = 3e-4  # per sqrt(s): keeps the position pivots of the Cholesky elimination well conditioned
 
 
@@ -26,14 +29,16 @@ def add_imu_factors(graph: gtsam.NonlinearFactorGraph, vehicle: VehicleVariables
     t, K = vehicle.t_s, len(vehicle.t_s)
     vehicle.preintegrated_bias = vehicle.bias.copy()
     inputs = gtsam_inputs(vehicle.imu, t[:-1], t[1:], vehicle.bias[:-1])
+    missing = crossing(vehicle.gaps_s, t[:-1], t[1:])
     middle = vehicle.r[:-1] + 0.5 * vehicle.v[:-1] * np.diff(t)[:, None]
     gravity = vehicle.frame.gravitation(middle) + vehicle.origin_centrifugal()
     w_ie = vehicle.frame.w_ie_n
     for k in range(K - 1):
         params = gtsam.PreintegrationCombinedParams(gravity[k])
         params.setOmegaCoriolis(w_ie)
-        params.setGyroscopeCovariance(np.eye(3) * noise.gyro_rps_rthz**2)
-        params.setAccelerometerCovariance(np.eye(3) * noise.accel_mps2_rthz**2)
+        gyro, accel = (GAP_GYRO, GAP_ACCEL) if missing[k] else (noise.gyro_rps_rthz, noise.accel_mps2_rthz)
+        params.setGyroscopeCovariance(np.eye(3) * gyro**2)
+        params.setAccelerometerCovariance(np.eye(3) * accel**2)
         params.setIntegrationCovariance(np.eye(3) * INTEGRATION_SIGMA_M**2)
         params.setBiasOmegaCovariance(np.eye(3) * noise.gyro_bias_walk_rps_rts**2)
         params.setBiasAccCovariance(np.eye(3) * noise.accel_bias_walk_mps2_rts**2)
@@ -80,4 +85,9 @@ def motion_prior_rows(vehicle: VehicleVariables) -> tuple[Array, Array]:
 
 
 def motion_keys(vehicle: VehicleVariables, k: int) -> tuple[int, int, int, int]:
-    return (key("p", vehicle.index, k), key("v", vehicle.index, k), key("p", vehicle.index, k + 1), key("v", vehicle.index, k + 1))
+    return (
+        key("p", vehicle.index, k),
+        key("v", vehicle.index, k),
+        key("p", vehicle.index, k + 1),
+        key("v", vehicle.index, k + 1),
+    )

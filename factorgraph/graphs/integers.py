@@ -70,14 +70,10 @@ def start_ambiguities(data: GnssLink) -> None:
     component = connected_arcs(block)
     for c in np.unique(component):
         members = np.flatnonzero(component == c)
-        datum = members[np.argmax(length[members])]
+        datum = int(members[np.argmax(length[members])])
         block.amb_value[members] -= block.amb_value[datum] - np.round(block.amb_value[datum])
         block.amb_key[datum] = 0
         data.state[datum] = "datum"
-    # rows whose arc is alone in its clock group say nothing about the integers or the position
-    for arc in np.flatnonzero(length == 0):
-        block.amb_key[arc] = 0
-        data.state[arc] = "unused"
     block.renew()
 
 
@@ -138,7 +134,12 @@ def tail_covariance(net: gtsam.GaussianBayesNet, keys: list[int]) -> Array:
 
 def fix_integers(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNet, settings: AmbiguitySettings) -> FixRound:
     """Fix what can be fixed of all free ambiguities jointly; fixed ones become constants."""
-    free = [(data, i) for data in links for i in range(len(data.block.amb_key)) if data.block.amb_key[i] != 0 and data.state[i] == "float"]
+    free = [
+        (data, i)
+        for data in links
+        for i in range(len(data.block.amb_key))
+        if data.block.amb_key[i] != 0 and data.state[i] == "float"
+    ]
     if not free:
         return FixRound(0, np.nan, 1.0)
     keys = [int(d.block.amb_key[i]) for d, i in free]

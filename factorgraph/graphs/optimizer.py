@@ -68,11 +68,11 @@ class Graph:
             mine = np.array([int(k) in used for k in gnss.amb_key], bool)
             _put(self.values, gnss.amb_key[mine], gnss.amb_value[mine])
         self.last = sorted(used)
-        for block in self.ranges:
-            if block.parameter is not None and block.parameter not in self.last:
-                if not self.values.exists(block.parameter):
-                    self.values.insert(block.parameter, block.value.copy())
-                self.last.append(block.parameter)
+        for ranges in self.ranges:
+            if ranges.parameter is not None and ranges.parameter not in self.last:
+                if not self.values.exists(ranges.parameter):
+                    self.values.insert(ranges.parameter, ranges.value.copy())
+                self.last.append(ranges.parameter)
 
     def take(self, values: gtsam.Values) -> None:
         """Make `values` current and evaluate every block there."""
@@ -85,9 +85,9 @@ class Graph:
                     gnss.amb_value[i] = values.atVector(int(k))[0]
             for i, k in enumerate(gnss.iono_key):
                 gnss.iono_value[i] = values.atVector(int(k))[0]
-        for block in self.ranges:
-            if block.parameter is not None:
-                block.value = values.atVector(block.parameter)
+        for ranges in self.ranges:
+            if ranges.parameter is not None:
+                ranges.value = values.atVector(ranges.parameter)
         for block in self.blocks:
             block.predict()
 
@@ -184,4 +184,3 @@ def optimise(
         if lam == 0.0 and decrease < tolerance * cost + 1e-6:
             return Result(Status.CONVERGED, costs, net)
     return Result(Status.MAX_ITERATIONS, costs, net)
-

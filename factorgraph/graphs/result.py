@@ -11,11 +11,12 @@ import numpy as np
 
 from factorgraph import geodesy
 from factorgraph.attitude import quat_from_matrix
-from factorgraph.graphs.blocks import KINDS, Block, GnssBlock, IonosphereBlock, JointBlock, MotionBlock
+from factorgraph.graphs.blocks import KINDS, Block, IonosphereBlock, JointBlock, MotionBlock
 from factorgraph.graphs.build import Built, GnssLink
 from factorgraph.graphs.covariance import JointCovariance
 from factorgraph.graphs.integers import tail_covariance
 from factorgraph.graphs.optimizer import Graph, Result
+from factorgraph.graphs.remarks import gap_remarks, unplaced_notes
 from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.problem import Link, NavigationProblem
 from factorgraph.solution import (
@@ -39,7 +40,9 @@ FIXED_DIFFERENCES = 4  # double differences with integers that make an epoch fix
 BETWEEN_EPOCHS_S = 2.0  # a state between two epochs no further apart shares their status
 
 
-def make_solution(problem: NavigationProblem, built: Built, result: Result, ratio: float, spent: dict[str, float], notes: list[str]) -> Solution:
+def make_solution(
+    problem: NavigationProblem, built: Built, result: Result, ratio: float, spent: dict[str, float], notes: list[str]
+) -> Solution:
     """Collect everything known after the optimisation."""
     graph = built.graph
     net = graph.covariance_net()
@@ -50,6 +53,7 @@ def make_solution(problem: NavigationProblem, built: Built, result: Result, rati
     pairs = tuple(_pair(problem, p, ends, cov, links, ratio) for p in problem.wanted_pairs)
     residuals = _residuals(graph, problem.settings.outlier_sigma)
     nis_t, nis, dof = _nis(graph, cov)
+    gap_notes, gap_warnings = gap_remarks(problem, graph.vehicles)
     return Solution(
         name=problem.name,
         method="graph",
@@ -67,8 +71,8 @@ def make_solution(problem: NavigationProblem, built: Built, result: Result, rati
             nis_t_s=nis_t,
             nis=nis,
             nis_dof=dof,
-            warnings=tuple(_warnings(problem, built, result.status, net is None, pairs)),
-            notes=(*notes, *_slip_notes(built.links)),
+            warnings=(*_warnings(problem, built, result.status, net is None, pairs), *gap_warnings),
+            notes=(*notes, *_slip_notes(built.links), *gap_notes, *unplaced_notes(problem)),
             parameters=_parameters(graph, cov),
         ),
         configuration=configuration(problem),
@@ -113,7 +117,8 @@ def configuration(problem: NavigationProblem) -> dict[str, object]:
         },
         "links": [plain(link) for link in problem.links],
         "ranges": [
-            {"name": m.stream.name, "bias_sigma_m": m.bias_sigma_m, "scale_sigma": m.scale_sigma, "per_pair": m.per_pair} for m in problem.ranges
+            {"name": m.stream.name, "bias_sigma_m": m.bias_sigma_m, "scale_sigma": m.scale_sigma, "per_pair": m.per_pair}
+            for m in problem.ranges
         ],
     }
 
@@ -271,32 +276,33 @@ def _fix_status(link: GnssLink | None, rover: VehicleVariables, K: int, ratio: f
 
 
 def _ambiguities(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNet | None) -> AmbiguityTable:
-    rows: list[tuple[str, str, str, float, float, float, float, float, str]] = []
-    for data in links:
-        block = data.block
-        free = [i for i in range(len(block.amb_key)) if block.amb_key[i] != 0 and graph.values.exists(int(block.amb_key[i]))]
-        sigma = np.full(len(block.amb_key), np.nan)
-        if free and net is not None:
-            sigma[free] = np.sqrt(np.diag(tail_covariance(net, [int(block.amb_key[i]) for i in free])))
-        for i, state in enumerate(data.state):
-            integer = float(block.amb_value[i]) if state in ("fixed", "datum") else np.nan
-            rows.append(
-                (
-                    f"{data.link.reference}-{data.link.rover}",
-                    data.arc_satellite[i],
-                    data.arc_signal[i],
-                    float(data.arc_start_s[i]),
-                    float(data.arc_end_s[i]),
-                    float(data.float_cyc[i]) if len(data.float_cyc) else float(block.amb_value[i]),
-                    float(data.float_sigma[i]) if state == "fixed" and len(data.float_sigma) else float(sigma[i]),
-                    integer,
-                    state,
-                )
-            )
-    if not rows:
+    links = [data for data in links if len(data.state)]
+    if not links:
         return AmbiguityTable()
-    c = list(zip(*rows, strict=True))
-    return AmbiguityTable(c[0], c[1], c[2], *(np.array(x, float) for x in c[3:8]), c[8])
+    names, values, sigmas, integers = [], [], [], []
+    for data in links:
+        keys = data.block.amb_key
+        state = np.array(data.state)
+        held = np.isin(state, ["fixed", "datum"])
+        sigma = np.where(state == "fixed", data.float_sigma, np.nan) if len(data.float_sigma) else np.full(len(keys), np.nan)
+        free = np.array([k != 0 and graph.values.exists(int(k)) for k in keys])
+        if np.any(free) and net is not None:
+            sigma[free] = np.sqrt(np.diag(tail_covariance(net, [int(k) for k in keys[free]])))
+        names += [f"{data.link.reference}-{data.link.rover}"] * len(keys)
+        values.append(data.float_cyc if len(data.float_cyc) else data.block.amb_value)
+        sigmas.append(sigma)
+        integers.append(np.where(held, data.block.amb_value, np.nan))
+    return AmbiguityTable(
+        link=tuple(names),
+        satellite=tuple(s for data in links for s in data.arc_satellite),
+        signal=tuple(s for data in links for s in data.arc_signal),
+        t_start_s=np.concatenate([data.arc_start_s for data in links]),
+        t_end_s=np.concatenate([data.arc_end_s for data in links]),
+        float_cyc=np.concatenate(values),
+        sigma_cyc=np.concatenate(sigmas),
+        integer=np.concatenate(integers),
+        state=tuple(s for data in links for s in data.state),
+    )
 
 
 def _measured(graph: Graph) -> list[Block]:
@@ -318,7 +324,18 @@ def _residuals(graph: Graph, outlier_sigma: float) -> ResidualTable:
         source = np.array([_index(sources, n) for n in names])[rows.group_index]
         label = np.array([_index(labels, n) for n in rows.label])[rows.label_index]
         outlier: BoolArray = np.abs(t) > outlier_sigma
-        columns = (rows.kind, source, label, rows.t_s, b.residuals(), rows.sigma, b.w, outlier, rows.azimuth_rad, rows.elevation_rad)
+        columns = (
+            rows.kind,
+            source,
+            label,
+            rows.t_s,
+            b.residuals(),
+            rows.sigma,
+            b.w,
+            outlier,
+            rows.azimuth_rad,
+            rows.elevation_rad,
+        )
         parts.append(tuple(np.asarray(c)[active] for c in columns))
     joined = [np.concatenate([p[i] for p in parts]) for i in range(len(parts[0]))]
     return ResidualTable(KINDS, tuple(sources), tuple(labels), *joined)
@@ -376,7 +393,9 @@ def _parameters(graph: Graph, cov: JointCovariance | None) -> dict[str, tuple[fl
     return out
 
 
-def _warnings(problem: NavigationProblem, built: Built, status: Status, singular: bool, pairs: tuple[PairSolution, ...]) -> list[str]:
+def _warnings(
+    problem: NavigationProblem, built: Built, status: Status, singular: bool, pairs: tuple[PairSolution, ...]
+) -> list[str]:
     out = []
     if status is not Status.CONVERGED:
         out.append(f"the optimisation stopped early: {status.value}")

@@ -22,11 +22,12 @@ import numpy as np
 
 from factorgraph.attitude import exp_so3, skew
 from factorgraph.geodesy import LocalFrame, centrifugal_ecef
+from factorgraph.grid import MERGE_S
 from factorgraph.measurements import ImuStream
 from factorgraph.models import preintegration
 from factorgraph.models.preintegration import Increments
 from factorgraph.problem import Vehicle
-from factorgraph.types import Array, IntArray
+from factorgraph.types import Array, BoolArray, IntArray
 
 Mode = Literal["imu", "motion", "fixed"]
 NEAR_S = 5e-3  # closer to a state than this, constant velocity carries the point
@@ -75,6 +76,7 @@ class VehicleVariables:
         self.R = np.tile(np.eye(3), (K, 1, 1))
         self.bias = np.zeros((K, 6))  # gyroscope, accelerometer
         self.preintegrated_bias = np.zeros((K, 6))
+        self.gaps_s = preintegration.gaps(self.imu) if self.mode == "imu" else np.zeros((0, 2))
 
     @property
     def imu(self) -> ImuStream:
@@ -99,18 +101,31 @@ class VehicleVariables:
         lever = np.broadcast_to(np.asarray(lever_b, float), (len(t_s), 3))
         if self.mode != "imu":  # nearest state: dt is small, or the vehicle does not move
             k = np.clip(np.searchsorted(self.t_s, t_s), 1, max(len(self.t_s) - 1, 1))
-            k = np.minimum(np.where(t_s - self.t_s[k - 1] <= self.t_s[np.minimum(k, len(self.t_s) - 1)] - t_s, k - 1, k), len(self.t_s) - 1)
+            k = np.minimum(
+                np.where(t_s - self.t_s[k - 1] <= self.t_s[np.minimum(k, len(self.t_s) - 1)] - t_s, k - 1, k), len(self.t_s) - 1
+            )
             return Query(k, t_s - self.t_s[k], lever, None)
-        k = np.clip(np.searchsorted(self.t_s, t_s + NEAR_S, side="right") - 1, 0, len(self.t_s) - 1)
+        k = self._before(t_s)
         dt = t_s - self.t_s[k]
         if np.all(dt <= NEAR_S):
             return Query(k, dt, lever, None)
         return Query(k, dt, lever, self._increments(k, dt))
 
+    def is_carried(self, t_s: Array) -> BoolArray:
+        """At which times (n,) points follow from a state: with an IMU, where no sample is missing since that state."""
+        k = self._before(t_s)
+        return (t_s - self.t_s[k] <= MERGE_S) | ~preintegration.crossing(self.gaps_s, self.t_s[k], t_s)
+
+    def _before(self, t_s: Array) -> IntArray:
+        """Latest states at or before times (n,)."""
+        return np.clip(np.searchsorted(self.t_s, t_s + NEAR_S, side="right") - 1, 0, len(self.t_s) - 1)
+
     def _increments(self, k: IntArray, dt: Array) -> Increments:
         order = np.lexsort((dt, k))
         start = self.t_s[k]
-        inc = preintegration.integrate(self.imu, start[order], start[order] + np.maximum(dt[order], 0.0), self.preintegrated_bias[k[order]])
+        inc = preintegration.integrate(
+            self.imu, start[order], start[order] + np.maximum(dt[order], 0.0), self.preintegrated_bias[k[order]]
+        )
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
         return Increments(*(getattr(inc, name)[back] for name in Increments.__dataclass_fields__))
@@ -125,7 +140,7 @@ class VehicleVariables:
         """Angular rate of body relative to n (n, 3) at times, from the gyroscope less bias and Earth rate."""
         i = np.clip(np.searchsorted(self.imu.t_s, t_s), 0, len(self.imu.t_s) - 1)
         w_ie_b = np.einsum("nji,j->ni", self.R[k], self.frame.w_ie_n)
-        return self.imu.w_b[i] - self.bias[k, :3] - w_ie_b
+        return np.asarray(self.imu.w_b[i] - self.bias[k, :3] - w_ie_b)
 
     def gravity_terms(self, k: IntArray) -> Array:
         """g - 2 w_ie x v at states k (n, 3)."""

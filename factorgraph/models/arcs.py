@@ -112,7 +112,9 @@ def _geometry_free_slips(
     return jump[here]
 
 
-def split_at_steps(residual: Array, sigma: Array, arc: IntArray, order_t: Array, min_step: Array, min_epochs: int) -> tuple[IntArray, int]:
+def split_at_steps(
+    residual: Array, sigma: Array, arc: IntArray, order_t: Array, min_step: Array, min_epochs: int
+) -> tuple[IntArray, int]:
     """Split arcs whose residuals (n,) step by more than five sigma and `min_step` (n,); returns new arcs and the number split.
 
     The split is where the two-sample statistic |m_1 - m_2| / sqrt(s^2/n_1 + s^2/n_2) is largest; s comes from the

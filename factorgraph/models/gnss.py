@@ -67,7 +67,9 @@ class Prepared:
     elevation_rad: Array  # (n,)
 
 
-def prepare(stream: GnssStream, frame: LocalFrame, r_n: Array, clock_s: Array, klobuchar: Array | None, tow0_s: float) -> Prepared:
+def prepare(
+    stream: GnssStream, frame: LocalFrame, r_n: Array, clock_s: Array, klobuchar: Array | None, tow0_s: float
+) -> Prepared:
     """Correct a receiver's rows given approximate antenna positions r_n (m, 3) and clock offsets (m,) per epoch.
 
     Positions good to 10 m leave 1e-4 m in single ranges and nothing in differences.
@@ -192,8 +194,8 @@ def single_point(stream: GnssStream, noise: GnssNoise, systems: str, klobuchar: 
     sq = np.bincount(here, np.where(mask, res**2, 0.0), len(ids))
     v = _doppler_velocity(stream, rows, e, vel, mask, clocks, at_epoch, noise)
 
-    def spread(values: Array, fill: float = np.nan) -> Array:
-        out = np.full((m, *values.shape[1:]), fill)
+    def spread(values: Array) -> Array:
+        out = np.full((m, *values.shape[1:]), np.nan)
         out[ids] = values
         return out
 
@@ -201,7 +203,9 @@ def single_point(stream: GnssStream, noise: GnssNoise, systems: str, klobuchar: 
     r[~good] = np.nan
     first_clock = np.where(good, first_clock, np.nan)
     rms = np.sqrt(sq / np.maximum(dof, 1))
-    return SinglePoint(spread(r), spread(first_clock) / C_MPS, spread(v), spread(used, 0).astype(np.int64), spread(np.where(good, rms, np.nan)))
+    n_sat = np.zeros(m, np.int64)
+    n_sat[ids] = used
+    return SinglePoint(spread(r), spread(first_clock) / C_MPS, spread(v), n_sat, spread(np.where(good, rms, np.nan)))
 
 
 def _solve_epochs(J: Array, y: Array, at_epoch: CommonGroups) -> Array:
@@ -216,7 +220,14 @@ def _solve_epochs(J: Array, y: Array, at_epoch: CommonGroups) -> Array:
 
 
 def _doppler_velocity(
-    stream: GnssStream, rows: IntArray, e: Array, vel: Array, mask: BoolArray, clocks: CommonGroups, at_epoch: CommonGroups, noise: GnssNoise
+    stream: GnssStream,
+    rows: IntArray,
+    e: Array,
+    vel: Array,
+    mask: BoolArray,
+    clocks: CommonGroups,
+    at_epoch: CommonGroups,
+    noise: GnssNoise,
 ) -> Array:
     rate = -stream.doppler_hz[rows] * stream.wavelength_m[rows] + stream.sat_clock_mps[rows]
     ok = mask & np.isfinite(rate) & np.all(np.isfinite(vel), axis=1)
@@ -245,14 +256,18 @@ class PairedRows:
     group_names: tuple[str, ...]
 
 
-def pair_rows(a: GnssStream, b: GnssStream, usable_a: BoolArray, usable_b: BoolArray, bands: str, tolerance_s: float = 0.02) -> PairedRows:
+def pair_rows(
+    a: GnssStream, b: GnssStream, usable_a: BoolArray, usable_b: BoolArray, bands: str, tolerance_s: float = 0.02
+) -> PairedRows:
     """Match epochs, satellites and bands of two receivers; one signal per satellite and band.
 
     Signals of one band are matched by the same tracking mode where both have it (C with C, W with W), else by each
     receiver's best; unlike modes form their own clock group, since their biases differ.
     """
     nearest = np.clip(np.searchsorted(a.t_s, b.t_s), 1, max(len(a.t_s) - 1, 1))
-    nearest = np.where(np.abs(a.t_s[nearest - 1] - b.t_s) <= np.abs(a.t_s[np.minimum(nearest, len(a.t_s) - 1)] - b.t_s), nearest - 1, nearest)
+    nearest = np.where(
+        np.abs(a.t_s[nearest - 1] - b.t_s) <= np.abs(a.t_s[np.minimum(nearest, len(a.t_s) - 1)] - b.t_s), nearest - 1, nearest
+    )
     nearest = np.minimum(nearest, len(a.t_s) - 1)
     matched = np.abs(a.t_s[nearest] - b.t_s) <= tolerance_s
     epoch_of_a = np.full(len(a.t_s), -1)

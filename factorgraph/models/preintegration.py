@@ -20,9 +20,11 @@ import numpy as np
 from numba import njit
 
 from factorgraph.measurements import ImuStream
-from factorgraph.types import Array, IntArray
+from factorgraph.types import Array, BoolArray, IntArray
 
 PAIR_S = 0.1  # two GTSAM steps
+GAP_S, GAP_SAMPLES = 0.1, 10.0  # longer than both, in nominal intervals, is a gap and not a late sample
+AROUND_GAP = 10  # samples on either side that stand for the missing ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,16 +136,47 @@ def _integrate(edges, f, w, start, stop, bias, dt_out, dR_out, dv_out, dp_out, J
         dR_out[i], dv_out[i], dp_out[i], J_out[i], w_out[i] = dR, dv, dp, J, w[k]
 
 
+def gap_rows(t_s: Array) -> IntArray:
+    """Rows of sample times (n,) after which samples are missing."""
+    step = np.diff(t_s)
+    if len(step) < 2:
+        return np.zeros(0, np.int64)
+    return np.flatnonzero((step > GAP_S) & (step > GAP_SAMPLES * np.median(step)))
+
+
+def gaps(imu: ImuStream) -> Array:
+    """Start and end (m, 2) of the stretches without samples."""
+    i = gap_rows(imu.t_s)
+    return np.column_stack([imu.t_s[i], imu.t_s[i + 1]])
+
+
+def crossing(gaps_s: Array, start_s: Array, stop_s: Array) -> BoolArray:
+    """Which intervals (start, stop] (n,) reach into one of the gaps (m, 2), by more than rounding."""
+    if not len(gaps_s):
+        return np.zeros(len(start_s), bool)
+    next_gap = np.minimum(np.searchsorted(gaps_s[:, 1], start_s + 1e-6, side="right"), len(gaps_s) - 1)
+    return np.asarray((gaps_s[next_gap, 0] < stop_s - 1e-6) & (gaps_s[next_gap, 1] > start_s + 1e-6))
+
+
 def sample_means(imu: ImuStream) -> tuple[Array, Array, Array]:
     """Edges (n + 1,) and the mean force and rate (n, 3) between them.
 
-    Instantaneous samples become trapezoidal means; the first sample also covers one interval before itself.
+    Instantaneous samples become trapezoidal means; the first sample also covers one interval before itself. A gap gets
+    the mean of the samples around it.
     """
+    edges, f, w = _means(imu)
+    for i in gap_rows(imu.t_s):
+        around = slice(max(i + 1 - AROUND_GAP, 0), i + 1 + AROUND_GAP)
+        f[i + 1], w[i + 1] = imu.f_b[around].mean(axis=0), imu.w_b[around].mean(axis=0)
+    return edges, f, w
+
+
+def _means(imu: ImuStream) -> tuple[Array, Array, Array]:
     t = imu.t_s
     first = t[0] - (t[1] - t[0]) if len(t) > 1 else t[0] - 1e-2
     edges = np.concatenate([[first], t])
     if imu.is_mean:
-        return edges, np.ascontiguousarray(imu.f_b), np.ascontiguousarray(imu.w_b)
+        return edges, imu.f_b.copy(), imu.w_b.copy()
 
     def trapezoid(x: Array) -> Array:
         return np.concatenate([x[:1], 0.5 * (x[1:] + x[:-1])])
@@ -159,16 +192,17 @@ def integrate(imu: ImuStream, start_s: Array, stop_s: Array, bias: Array) -> Inc
     """
     n = len(start_s)
     edges, f, w = sample_means(imu)
-    out = Increments(
-        np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)), *(np.zeros((n, 3, 3)) for _ in range(5)), np.zeros((n, 3))
+    start, stop = np.asarray(start_s, float), np.asarray(stop_s, float)
+    dt, dR, dv, dp, J, rate = (
+        np.zeros(n),
+        np.zeros((n, 3, 3)),
+        np.zeros((n, 3)),
+        np.zeros((n, 3)),
+        np.zeros((n, 5, 3, 3)),
+        np.zeros((n, 3)),
     )
-    J = np.zeros((n, 5, 3, 3))
-    _integrate(
-        edges, f, w, np.asarray(start_s, float), np.asarray(stop_s, float), np.asarray(bias, float), out.dt_s, out.dR, out.dv, out.dp, J, out.w_b
-    )
-    for k, block in enumerate((out.dR_dbg, out.dv_dbg, out.dv_dba, out.dp_dbg, out.dp_dba)):
-        block[:] = J[:, k]
-    return out
+    _integrate(edges, f, w, start, stop, np.asarray(bias, float), dt, dR, dv, dp, J, rate)
+    return Increments(dt, dR, dv, dp, J[:, 0], J[:, 1], J[:, 2], J[:, 3], J[:, 4], rate)
 
 
 @njit(cache=True)

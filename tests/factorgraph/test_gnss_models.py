@@ -78,8 +78,8 @@ def test_exact_observations_give_the_exact_point(flight: SimulatedFlight, system
     frame = flight.problem.frame
     np.testing.assert_allclose(frame.from_ecef(point.r_ecef), r, atol=1e-3)
     np.testing.assert_allclose(point.clock_s * C_MPS, clock * C_MPS, atol=1e-3)
-    # velocities in the Earth-fixed frame of transmission: omega x s tau is left out, in common mode but for millimetres
-    np.testing.assert_allclose(frame.rotate_from_ecef(point.v_ecef), v, atol=0.01)
+    # second-order terms of the range rate are left out
+    np.testing.assert_allclose(frame.rotate_from_ecef(point.v_ecef), v, atol=5e-3)
     assert np.all(point.rms_m < 1e-3) and np.all(point.n_sat >= 5)
 
 

@@ -1,0 +1,67 @@
+"""What a solution says of its input: stretches without IMU samples, vehicles whose place on Earth nothing tells."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.problem import NavigationProblem
+from factorgraph.types import Array
+
+DEGRADING_GAP_S = 1.0
+LISTED_GAPS = 5
+
+
+def gap_remarks(problem: NavigationProblem, vehicles: list[VehicleVariables]) -> tuple[list[str], list[str]]:
+    """Notes on the IMU gaps of each vehicle, and warnings of those longer than DEGRADING_GAP_S."""
+    notes, warnings = [], []
+    for v in vehicles:
+        gaps = v.gaps_s[(v.gaps_s[:, 1] > v.t_s[0]) & (v.gaps_s[:, 0] < v.t_s[-1])]
+        long = gaps[:, 1] - gaps[:, 0] > DEGRADING_GAP_S
+        lost = _not_carried(problem, v)
+        if np.any(~long):
+            notes.append(f"{v.name}: no IMU samples {_listed(gaps[~long])}; motion in between follows from the other sensors")
+        if np.any(long):
+            warnings.append(f"{v.name}: no IMU samples {_listed(gaps[long])}; attitude and motion in between are poorly known")
+        if lost:
+            notes.append(f"{v.name}: {lost} ranges and heights without IMU samples since the last state are left out")
+    return notes, warnings
+
+
+def _listed(gaps: Array) -> str:
+    shown = ", ".join(f"from {a:.2f} to {b:.2f} s" for a, b in gaps[:LISTED_GAPS].tolist())
+    more = len(gaps) - LISTED_GAPS
+    return shown if more <= 0 else f"{shown} and {more} times more ({np.diff(gaps[LISTED_GAPS:]).sum():.1f} s)"
+
+
+def _not_carried(problem: NavigationProblem, v: VehicleVariables) -> int:
+    times = [h.t_s for h in v.vehicle.heights]
+    for model in problem.ranges:
+        mine = np.array([tag.vehicle == v.name for tag in model.stream.tags])
+        times.append(model.stream.t_s[mine[model.stream.tag_a] | mine[model.stream.tag_b]])
+    t = np.concatenate([np.zeros(0), *times])
+    t = t[(t >= v.t_s[0]) & (t <= v.t_s[-1])]
+    return int(np.sum(~v.is_carried(t)))
+
+
+def unplaced_notes(problem: NavigationProblem) -> list[str]:
+    """A note for every group of vehicles, tied by links and ranges, none of which has an absolute position."""
+    group = {v.name: v.name for v in problem.vehicles}
+    placed = {v.name for v in problem.vehicles if v.is_fixed or v.positions or (v.gnss and problem.settings.use_absolute)}
+    ties = [(link.reference, link.rover) for link in problem.links]
+    for model in problem.ranges:
+        tags = model.stream.tags
+        for i, j in np.unique(np.column_stack([model.stream.tag_a, model.stream.tag_b]), axis=0).tolist():
+            ends = [name for name in (tags[i].vehicle, tags[j].vehicle) if name is not None]
+            if len(ends) == 2:
+                ties.append((ends[0], ends[1]))
+            else:
+                placed.update(ends)
+    for a, b in ties:
+        group = {name: group[a] if of == group[b] else of for name, of in group.items()}
+    notes = []
+    for first in dict.fromkeys(group.values()):
+        members = [name for name, of in group.items() if of == first]
+        if not placed & set(members):
+            notes.append(f"{', '.join(members)}: no absolute position is measured; only what is relative can be trusted")
+    return notes

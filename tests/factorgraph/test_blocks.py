@@ -1,0 +1,385 @@
+"""Measurement blocks: every Jacobian against central differences through GTSAM's own perturbations.
+
+A step fits its variable: 10 m where satellites are 2e7 m away, 1 cm where tags are 30 m apart (style: errors of truncation
+and of rounding both far below the tolerance).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from factorgraph.attitude import exp_so3
+from factorgraph.gpstime import GpsTime
+from factorgraph.graphs import integers
+from factorgraph.graphs.blocks import PHASE, Block, GnssBlock, IonosphereBlock, RangeBlock
+from factorgraph.graphs.build import (
+    GnssLink,
+    absolute_block,
+    add_ionosphere,
+    joint_block,
+    link_block,
+    motion_block,
+    odometry_block,
+    position_blocks,
+    range_blocks,
+    receivers,
+)
+from factorgraph.graphs.optimizer import Graph
+from factorgraph.graphs.variables import VehicleVariables, key
+from factorgraph.measurements import GnssStream, HeightStream, ImuStream, OdometryStream, PositionStream, RangeStream, Tag
+from factorgraph.models.differencing import CommonGroups
+from factorgraph.problem import AmbiguitySettings, Antenna, Link, NavigationProblem, RangeModel, Settings, Vehicle
+from factorgraph.types import Array
+from tests.factorgraph.synthetic import FRAME, every, receiver
+
+GRID = np.arange(5.0)
+SATELLITES = ("G01", "G02", "G03", "G04", "G05", "G06", "E11", "E12", "E13")
+LEVER = {"a": (0.3, -1.2, 0.8), "b": (-0.2, 0.9, 0.4)}
+PLACE_N = {"a": np.array([20.0, -30.0, 12.0]), "b": np.array([48.0, -21.0, 25.0])}
+STEP = {"x": (3e-3, 0.01), "p": (0.01,), "v": (1.0,), "b": (1e-2, 1e-3), "a": (1.0,), "i": (1.0,), "s": (0.01,)}  # halves of the columns
+GNSS_STEP = STEP | {"x": (3e-3, 10.0), "p": (10.0,)}
+MODES = ("imu", "motion", "fixed")
+
+
+def observed(name: str, offset_s: float) -> GnssStream:
+    """Epochs at the grid plus an offset; two bands of one constellation, one of another."""
+    t = GRID[:-1] + offset_s
+    rows = [r for r in every(len(t), SATELLITES, ("G1C", "G2W", "E1C")) if r[1][0] == r[2][0]]
+    r_n = PLACE_N[name] + np.outer(t, [8.0, 15.0, 1.0])
+    return receiver(t, rows, r_n=r_n, v_n=np.tile([8.0, 15.0, 1.0], (len(t), 1)), clock_m=25.0)
+
+
+def vehicle(name: str, mode: str, offset_s: float) -> Vehicle:
+    rng = np.random.default_rng(ord(name))
+    t = np.arange(-2, 220) / 50.0
+    imu = ImuStream(t, rng.normal(0, 1, (len(t), 3)) + [0, 0, 9.8], rng.normal(0.1, 0.3, (len(t), 3)), True)
+    at = GRID[:-1] + offset_s
+    n = len(at)
+    return Vehicle(
+        name,
+        imu=imu if mode == "imu" else None,
+        gnss=Antenna(observed(name, offset_s), LEVER[name]),
+        positions=(PositionStream(at, rng.normal(0, 30, (n, 3)), rng.uniform(0.5, 2, (n, 3)), LEVER[name]),),
+        heights=(HeightStream(np.sort(rng.uniform(0, 4, 9)), rng.normal(10, 3, 9), np.full(9, 0.7), LEVER[name]),),
+        odometry=OdometryStream(np.arange(-2, 90) / 20.0, np.full(92, 0.8), np.full(92, 0.02)) if mode == "motion" else None,
+        fixed_n=tuple(PLACE_N[name].tolist()) if mode == "fixed" else None,
+    )
+
+
+def variables(index: int, v: Vehicle) -> VehicleVariables:
+    """States about the truth, biases away from those preintegrated at."""
+    rng = np.random.default_rng(100 + index)
+    out = VehicleVariables(index, v, GRID, FRAME)
+    if v.is_fixed:
+        return out
+    out.r = PLACE_N[v.name] + np.outer(GRID, [8.0, 15.0, 1.0]) + rng.normal(0, 1.0, (5, 3))
+    out.v = np.array([8.0, 15.0, 1.0]) + rng.normal(0, 1.0, (5, 3))
+    out.R = exp_so3(rng.normal(0, 1.0, (5, 3)))
+    out.bias = rng.normal(0, 1.0, (5, 6)) * [0.01, 0.01, 0.01, 0.1, 0.1, 0.1]
+    out.preintegrated_bias = out.bias + rng.normal(0, 1.0, (5, 6)) * [1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01]
+    return out
+
+
+def problem_of(modes: tuple[str, str], offset_s: float = 0.0) -> tuple[NavigationProblem, dict[str, VehicleVariables]]:
+    """Reference a and rover b."""
+    vehicles = tuple(vehicle(name, mode, offset_s) for name, mode in zip("ab", modes, strict=True))
+    settings = Settings(ambiguity=AmbiguitySettings(min_arc_epochs=2), ionosphere_step_s=2.0)
+    problem = NavigationProblem("blocks", GpsTime(2300, 0.0), FRAME, vehicles, (Link("a", "b"),), settings=settings)
+    return problem, {v.name: variables(i, v) for i, v in enumerate(vehicles)}
+
+
+def evaluated(ends: dict[str, VehicleVariables], blocks: list[Block], seed: int = 0) -> Graph:
+    """A graph of these blocks at its values, with robust weights that differ from row to row."""
+    gnss, ranges = [b for b in blocks if isinstance(b, GnssBlock)], [b for b in blocks if isinstance(b, RangeBlock)]
+    graph = Graph(list(ends.values()), blocks, gtsam.NonlinearFactorGraph(), gnss, ranges)
+    graph.assemble()
+    graph.take(graph.values)
+    rng = np.random.default_rng(seed)
+    for block in blocks:
+        block.w = rng.uniform(0.2, 1.0, block.n)
+        block.whiten()
+    return graph
+
+
+def assert_jacobians(graph: Graph, block: Block, steps: dict[str, tuple[float, ...]], tolerance: float = 5e-5) -> None:
+    """Columns of every factor against central differences of its whitened rows, relative to the largest of each key's."""
+    base = graph.values
+    factors = range(len(block.rows.factor.start))
+    assert len(factors)
+    tried = set()
+    for f in factors:
+        i, j = block.slices(f)
+        keys, columns = block.keys(f), [c.copy() for c in block.columns(f)]
+        assert len(keys) == len(columns)
+        for k, J in zip(keys, columns, strict=True):
+            letter = chr(gtsam.symbolChr(k))
+            tried.add(letter)
+            n = J.shape[1]
+            size = np.repeat(steps[letter], n // len(steps[letter]))
+            numeric = np.zeros_like(J)
+            for column in range(n):
+                rows = []
+                for sign in (1.0, -1.0):
+                    delta = gtsam.VectorValues()
+                    delta.insert(k, sign * size[column] * np.eye(n)[column])
+                    graph.take(base.retract(delta))
+                    block.whiten()
+                    rows.append(block.e[i:j].copy())
+                numeric[:, column] = (rows[0] - rows[1]) / (2 * size[column])
+            # rounding of 2e7 m in a row of a few millimetres' sigma is the floor
+            bound = tolerance * np.abs(J * size).max() + 1e-6
+            assert np.abs((numeric - J) * size).max() < bound, f"factor {f}, {letter}: {np.abs((numeric - J) * size).max():.2g} against {bound:.2g}"
+    graph.take(base)
+    block.whiten()
+    assert tried
+
+
+def link_of(problem: NavigationProblem, ends: dict[str, VehicleVariables]) -> GnssLink:
+    data = link_block(problem, problem.links[0], ends, receivers(problem), 0, use_phase=True)
+    integers.start_ambiguities(data)
+    return data
+
+
+# -- Jacobians -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("modes", [("imu", "imu"), ("motion", "imu"), ("fixed", "imu"), ("imu", "motion"), ("fixed", "motion")])
+@pytest.mark.parametrize("offset_s", [0.0, 0.4])
+def test_differences_of_code_phase_and_doppler(modes: tuple[str, str], offset_s: float) -> None:
+    """On the grid and 0.4 s off it, where preintegration carries the antennas and biases come in."""
+    problem, ends = problem_of(modes, offset_s)
+    block = link_of(problem, ends).block
+    graph = evaluated(ends, [block])
+    letters = {chr(gtsam.symbolChr(k)) for f in range(4) for k in block.keys(f)}
+    assert "a" in letters and ("b" in letters) == (offset_s > 0 and "imu" in modes)
+    assert set(block.rows.kind.tolist()) == {0, 1, 2}
+    assert_jacobians(graph, block, GNSS_STEP, 2e-4)  # Earth rate times the time since the state, in velocities
+
+
+@pytest.mark.parametrize("mode", ["imu", "motion"])
+@pytest.mark.parametrize("offset_s", [0.0, 0.4])
+def test_undifferenced_code_and_doppler(mode: str, offset_s: float) -> None:
+    problem, ends = problem_of(("fixed", mode), offset_s)
+    block = absolute_block(problem, "b", ends, receivers(problem)["b"], with_code=True)
+    assert block is not None
+    assert_jacobians(evaluated(ends, [block]), block, GNSS_STEP, 2e-4)
+
+
+def test_ionosphere_of_a_long_link() -> None:
+    problem, ends = problem_of(("imu", "imu"), 0.4)
+    data = link_of(problem, ends)
+    prior = add_ionosphere(problem, data, 20_000.0)
+    assert prior is not None
+    data.block.iono_value[:] = np.random.default_rng(0).normal(0, 0.02, len(data.block.iono_value))
+    graph = evaluated(ends, [data.block, prior])
+    assert_jacobians(graph, data.block, GNSS_STEP, 2e-4)
+    assert_jacobians(graph, prior, GNSS_STEP)
+    assert {len(prior.keys(f)) for f in range(prior.n)} == {1, 2}
+
+
+@pytest.mark.parametrize("mode", ["imu", "motion"])
+@pytest.mark.parametrize("offset_s", [0.0, 0.4])
+def test_positions_and_heights(mode: str, offset_s: float) -> None:
+    problem, ends = problem_of(("fixed", mode), offset_s)
+    position, height = position_blocks(problem.vehicles[1], ends["b"])
+    graph = evaluated(ends, [position, height])
+    assert position.n == 12 and height.n == 9
+    for block in (position, height):
+        assert_jacobians(graph, block, STEP, 2e-4)
+
+
+def ranges_between(t: Array, anchors: bool) -> RangeModel:
+    tags = (Tag("a1", "a", LEVER["a"]), Tag("b1", "b", LEVER["b"]), Tag("b2", "b", (0.0, 1.0, 0.0)), Tag("x", position_n=(5.0, 60.0, -3.0)))
+    first, second = (np.full(len(t), 3), 1 + np.arange(len(t)) % 2) if anchors else (np.zeros(len(t), int), 1 + np.arange(len(t)) % 2)
+    return RangeModel(RangeStream(t, first, second, tags, np.full(len(t), 30.0), np.full(len(t), 0.1)), bias_sigma_m=0.3, scale_sigma=0.01)
+
+
+@pytest.mark.parametrize("modes", [("imu", "imu"), ("motion", "imu"), ("fixed", "motion")])
+@pytest.mark.parametrize("anchors", [True, False])
+def test_ranges_with_bias_and_scale(modes: tuple[str, str], anchors: bool) -> None:
+    """Both ends with lever arms, between states; the anchor named first is still the far end."""
+    _, ends = problem_of(modes)
+    t = np.sort(np.random.default_rng(1).uniform(0, 4, 12))
+    (block,) = range_blocks(ranges_between(t, anchors), ends, 0)
+    block.value[:] = [0.2, 0.03]
+    graph = evaluated(ends, [block])
+    assert block.n == 12 and gtsam.symbolChr(block.keys(0)[-1]) == ord("s")
+    assert_jacobians(graph, block, STEP, 2e-4)
+
+
+def test_motion_prior_and_odometry() -> None:
+    _, ends = problem_of(("fixed", "motion"))
+    motion, odometry = motion_block(ends["b"]), odometry_block(ends["b"])
+    assert odometry is not None
+    graph = evaluated(ends, [motion, odometry])
+    assert_jacobians(graph, motion, STEP)
+    assert_jacobians(graph, odometry, STEP | {"v": (0.01,)})
+
+
+# -- what rows mean --------------------------------------------------------------------------------
+
+
+def test_factors_hand_out_the_blocks_rows() -> None:
+    """What GTSAM linearises is what the block computed: errors, Jacobians and their keys."""
+    problem, ends = problem_of(("imu", "imu"), 0.4)
+    (ranges,) = range_blocks(ranges_between(np.array([0.5, 1.5, 2.6]), False), ends, 0)
+    blocks: list[Block] = [link_of(problem, ends).block, ranges, *position_blocks(problem.vehicles[1], ends["b"])]
+    graph = evaluated(ends, blocks)
+    linear = graph.graph.linearize(graph.values)
+    assert abs(graph.graph.error(graph.values) - 0.5 * sum(float(b.e @ b.e) for b in blocks)) < 1e-9 * graph.graph.error(graph.values)
+    index = 0
+    for block in blocks:
+        for f in range(len(block.rows.factor.start)):
+            factor = linear.at(index)
+            i, j = block.slices(f)
+            assert list(factor.keys()) == block.keys(f)
+            np.testing.assert_allclose(factor.getA(), np.hstack(block.columns(f)), atol=1e-12)
+            np.testing.assert_allclose(factor.getb(), -block.e[i:j], atol=1e-12)
+            index += 1
+    assert index == linear.size()
+
+
+def test_a_common_clock_moves_no_residual() -> None:
+    """Metres on every row of one clock: the graph does not see them; on one row it does."""
+    problem, ends = problem_of(("imu", "imu"))
+    block = link_of(problem, ends).block
+    evaluated(ends, [block])
+    before = block.e.copy()
+    clocks = block.rows.clocks
+    assert clocks is not None
+    block.z = block.z + np.random.default_rng(0).normal(0, 100.0, len(clocks.start))[clocks.of_row]
+    block.predict()
+    block.whiten()
+    np.testing.assert_allclose(block.e, before, atol=1e-4)
+    block.z[0] += 1.0
+    block.predict()
+    block.whiten()
+    assert np.abs(block.e - before).max() > 0.5
+
+
+def test_clocks_are_one_per_epoch_kind_and_signal() -> None:
+    problem, ends = problem_of(("imu", "imu"))
+    rows = link_of(problem, ends).block.rows
+    assert rows.clocks is not None
+    label = list(zip(rows.factor.of_row.tolist(), rows.kind.tolist(), rows.group_index.tolist(), strict=True))
+    assert len(set(label)) == len(rows.clocks.start) == 4 * 3 * 3
+    for group in range(len(rows.clocks.start)):
+        assert len({label[i] for i in np.flatnonzero(rows.clocks.of_row == group)}) == 1
+    assert {rows.group[g][0] for g in rows.group_index} == {"G", "E"}
+
+
+def test_integers_shift_phases_by_wavelengths() -> None:
+    """An ambiguity raised by a cycle is as an observation lowered by a wavelength; codes do not move."""
+    problem, ends = problem_of(("imu", "imu"))
+    block = link_of(problem, ends).block
+    evaluated(ends, [block])
+    before = block.y.copy()
+    block.amb_value[3] += 1.0
+    block.predict()
+    mine = (block.arc == 3) & (block.rows.kind == PHASE)
+    np.testing.assert_allclose(block.y - before, np.where(mine, -block.wavelength_m, 0.0), atol=1e-9)
+
+
+def test_constant_ambiguities_have_no_column() -> None:
+    problem, ends = problem_of(("imu", "imu"))
+    block = link_of(problem, ends).block
+    n = len(block.amb_key)
+    free = int(np.sum(block.amb_key != 0))
+    assert n - free == 3  # one datum per clock group
+    names = [k for k in block.keys(0) if gtsam.symbolChr(k) == ord("a")]
+    assert len(names) == free and set(names) == set(block.amb_key[block.amb_key != 0].tolist())
+    block.amb_key[:] = 0
+    block.renew()
+    assert not [k for k in block.keys(0) if gtsam.symbolChr(k) == ord("a")]
+    assert len(block.columns(0)) == len(block.keys(0)) == 4
+
+
+def test_exact_observations_leave_nothing() -> None:
+    """Antennas at rest on the points observed from: code, phase and Doppler of the hand-made sky vanish but for troposphere."""
+    problem, ends = problem_of(("motion", "motion"))
+    for name, v in ends.items():
+        v.r, v.v = PLACE_N[name] + np.outer(GRID, [8.0, 15.0, 1.0]), np.tile([8.0, 15.0, 1.0], (5, 1))
+    block = link_of(problem, ends).block
+    evaluated(ends, [block])
+    assert np.abs(block.residuals()).max() < 0.02  # 13 m of height between the antennas
+    np.testing.assert_allclose(block.amb_value, 0.0, atol=0.5)
+
+
+def test_normalised_residuals_have_unit_variance() -> None:
+    """Noise of each row's own sigma, its clock taken out by the same rows: leverage is accounted for."""
+    problem, ends = problem_of(("imu", "imu"))
+    block = link_of(problem, ends).block
+    evaluated(ends, [block])
+    block.w = np.ones(block.n)
+    rng = np.random.default_rng(3)
+    samples = []
+    for _ in range(3000):
+        block.y = rng.normal(0.0, 1.0, block.n) * block.rows.sigma + 50.0
+        samples.append(block.normalised())
+    np.testing.assert_allclose(np.std(samples, axis=0), 1.0, atol=0.07)
+
+
+def test_normalised_residual_of_an_outlier_is_its_own() -> None:
+    """One code 20 sigma off among others without noise: its share of the common clock does not hide it."""
+    problem, ends = problem_of(("imu", "imu"))
+    block = link_of(problem, ends).block
+    evaluated(ends, [block])
+    block.w = np.ones(block.n)
+    block.y = np.zeros(block.n)
+    block.y[1] = 20 * block.rows.sigma[1]
+    t = block.normalised()
+    assert np.argmax(np.abs(t)) == 1
+    h = CommonGroups.leverage(block.rows.clocks, 1 / block.rows.sigma)[1]  # type: ignore[arg-type]
+    assert abs(t[1] - 20 * np.sqrt(1 - h)) < 1e-9
+
+
+def test_inactive_rows_count_nowhere() -> None:
+    problem, ends = problem_of(("fixed", "imu"))
+    position, _ = position_blocks(problem.vehicles[1], ends["b"])
+    evaluated(ends, [position])
+    position.w = np.ones(position.n)
+    all_of_it = position.cost({})
+    position.active[4] = False
+    position.reweight({})
+    position.whiten()
+    assert position.w[4] == 0.0 and not np.any(position.Jw[4]) and position.e[4] == 0.0
+    assert abs(all_of_it - position.cost({}) - 0.5 * (position.y[4] / position.rows.sigma[4]) ** 2) < 1e-9 * all_of_it
+
+
+def test_joint_rows_carry_no_information() -> None:
+    _, ends = problem_of(("imu", "motion"))
+    block = joint_block(ends["a"], ends["b"])
+    evaluated(ends, [block])
+    assert not np.any(block.e) and not np.any(block.Jw)
+    assert block.keys(2) == [key("x", 0, 2), key("v", 0, 2), key("p", 1, 2), key("v", 1, 2)]
+
+
+def test_ionosphere_walks_between_steps() -> None:
+    """First of each satellite: the prior. Later: steps of the random walk. Code and phase bend opposite ways."""
+    problem, ends = problem_of(("imu", "imu"))
+    data = link_of(problem, ends)
+    prior = add_ionosphere(problem, data, 20_000.0)
+    assert isinstance(prior, IonosphereBlock)
+    sigma = 1e-6 * 20_000.0
+    first = prior.previous < 0
+    np.testing.assert_allclose(prior.rows.sigma[first], sigma)
+    np.testing.assert_allclose(prior.rows.sigma[~first], sigma * np.sqrt(2.0 / 600.0))
+    assert first.sum() == len(SATELLITES) == (~first).sum()
+    block = data.block
+    for satellite in range(3):
+        mine = (block.rows.label_index == satellite) & (block.rows.factor.of_row == 0)
+        code, phase = (block.iono_scale[mine & (block.rows.kind == kind)] for kind in (0, 1))
+        np.testing.assert_allclose(code, -phase)
+        np.testing.assert_allclose(np.sort(code / code.min()), np.sort(np.unique((block.wavelength_m[mine] / 0.1902936728) ** 2)), rtol=1e-6)
+        assert code.min() >= 1.0
+
+
+def test_short_links_have_no_ionosphere() -> None:
+    problem, ends = problem_of(("imu", "imu"))
+    assert add_ionosphere(problem, link_of(problem, ends), 5_000.0) is None
+    off = replace(problem, settings=replace(problem.settings, ionosphere_ppm=0.0))
+    assert add_ionosphere(off, link_of(problem, ends), 50_000.0) is None
