@@ -26,6 +26,7 @@ Source: Barfoot (2017), sec. 3.4, for the interpolation that the prior implies.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -38,6 +39,7 @@ from factorgraph.problem import NavigationProblem
 from factorgraph.solution import PairSolution, Solution, VehicleSolution
 from factorgraph.types import Array, BoolArray, IntArray
 
+Rate = float | Literal["imu"]  # Hz, or the times of the IMU
 CHUNK = 32_768  # times at once, which bounds memory
 
 
@@ -68,21 +70,22 @@ def interpolate(vehicle: VehicleSolution, imu: ImuStream | None, frame: LocalFra
     """
     t_s = np.asarray(t_s, float)
     _check_inside(vehicle.name, vehicle.t_s, t_s)
-    R = matrix_from_quat(vehicle.q_nb)
-    has_imu = _has_imu(vehicle, imu)
-    missing = _missing(vehicle, R, imu, has_imu, frame)
+    if not len(t_s):
+        return Trajectory(t_s, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)))
+    carrier = _Carrier(vehicle, imu, frame)
+    missing = carrier.missing()
     r_n, v_n, q_nb = np.empty((len(t_s), 3)), np.empty((len(t_s), 3)), np.empty((len(t_s), 4))
     order = np.argsort(t_s, kind="stable")
     for first in range(0, len(order), CHUNK):
         rows = order[first : first + CHUNK]
         k = earlier_state(vehicle.t_s, t_s[rows])
         dt = t_s[rows] - vehicle.t_s[k]
-        r, v, C = _carried(vehicle, R, imu, has_imu, frame, k, dt)
+        r, v, R = carrier.carried(k, dt)
         e_r, e_v, phi, T = (x[k] for x in missing)
         u, step = (dt / T)[:, None], T[:, None]
         r_n[rows] = r + u * u * ((3 - 2 * u) * e_r + (u - 1) * step * e_v)
         v_n[rows] = v + u * (6 * (1 - u) / step * e_r + (3 * u - 2) * e_v)
-        q_nb[rows] = quat_from_matrix(C @ exp_so3(u * phi))
+        q_nb[rows] = quat_from_matrix(R @ exp_so3(u * phi))
     return Trajectory(t_s, r_n, v_n, q_nb)
 
 
@@ -100,20 +103,21 @@ def interpolate_pair(
     return PairTrajectory(a.t_s, _rotated(C, b.r_n - a.r_n), _rotated(C, b.v_n - a.v_n))
 
 
-def resample(solution: Solution, problem: NavigationProblem, rate_hz: float | None = None) -> Solution:
-    """The solution with vehicles and pairs at `rate_hz`, or at the times of each vehicle's IMU.
+def resample(solution: Solution, problem: NavigationProblem, rate: Rate = "imu") -> Solution:
+    """The solution with vehicles and pairs at a rate [Hz], or at the times of each vehicle's IMU.
 
-    With a rate, times are multiples of 1 / rate since t0. Without, a pair follows its reference's IMU, else its rover's;
-    what has no IMU keeps its states. The truth of pairs is known at the states only and left out.
+    With a rate, times are multiples of 1 / rate since t0. At the rate of the IMU a pair follows its reference's, else its
+    rover's, and what has no IMU keeps its states. Pairs follow from their vehicles; their truth, known at the states
+    only, is left out. Every row holds a full covariance: 1.8 kB.
     Raises InputError for a rate that is not positive.
     """
-    if rate_hz is not None and not 0 < rate_hz < np.inf:
-        raise InputError(f"the rate of trajectories must be positive, got {rate_hz} Hz")
+    if rate != "imu" and not 0 < rate < np.inf:
+        raise InputError(f"the rate of trajectories must be positive, got {rate} Hz")
     imus = {v.name: v.imu for v in problem.vehicles}
     vehicles = [
-        _vehicle_at(v, imus.get(v.name), solution.frame, _times(v.t_s, rate_hz, imus.get(v.name))) for v in solution.vehicles
+        _vehicle_at(v, imus.get(v.name), solution.frame, _times(v.t_s, rate, imus.get(v.name))) for v in solution.vehicles
     ]
-    pairs = [_pair_at(solution, p, imus, rate_hz) for p in solution.pairs]
+    pairs = [_pair_at(solution, p, imus, rate) for p in solution.pairs]
     return replace(solution, vehicles=tuple(vehicles), pairs=tuple(pairs))
 
 
@@ -134,46 +138,48 @@ def _check_inside(name: str, state_s: Array, t_s: Array) -> None:
         )
 
 
-def _has_imu(vehicle: VehicleSolution, imu: ImuStream | None) -> BoolArray:
-    """States (K,) that have attitude and biases and no gap of the IMU's recording before the next state."""
-    if imu is None or not len(imu.t_s):
-        return np.zeros(len(vehicle.t_s), bool)
-    estimated = np.isfinite(np.hstack([vehicle.q_nb, vehicle.bias_gyro, vehicle.bias_accel])).all(axis=1)
-    ends = [[-np.inf, imu.t_s[0] - preintegration.GAP_S]], [[imu.t_s[-1] + preintegration.GAP_S, np.inf]]
-    gaps_s = np.vstack([ends[0], preintegration.gaps(imu), ends[1]])
-    following = np.append(vehicle.t_s[1:], vehicle.t_s[-1:])
-    return np.asarray(estimated & ~preintegration.crossing(gaps_s, vehicle.t_s, following))
+class _Carrier:
+    """States of a vehicle carried forward, by the IMU where it may."""
 
+    def __init__(self, vehicle: VehicleSolution, imu: ImuStream | None, frame: LocalFrame) -> None:
+        self.vehicle, self.imu, self.frame = vehicle, imu, frame
+        self.R = matrix_from_quat(vehicle.q_nb)
+        self.bias = np.hstack([vehicle.bias_gyro, vehicle.bias_accel])
+        self.by_imu = self._by_imu()
 
-def _carried(
-    vehicle: VehicleSolution, R: Array, imu: ImuStream | None, has_imu: BoolArray, frame: LocalFrame, k: IntArray, dt_s: Array
-) -> tuple[Array, Array, Array]:
-    """r_p, v_p (n, 3) and R_p (n, 3, 3): states k (n,), sorted, carried forward by dt_s (n,)."""
-    r, v, C = vehicle.r_n[k] + vehicle.v_n[k] * dt_s[:, None], vehicle.v_n[k], R[k]
-    i = np.flatnonzero(has_imu[k])
-    if imu is None or not len(i):
-        return r, v, C
-    start, dt, C_k = vehicle.t_s[k[i]], dt_s[i, None], C[i]
-    inc = preintegration.integrate(imu, start, start + dt_s[i], np.hstack([vehicle.bias_gyro[k[i]], vehicle.bias_accel[k[i]]]))
-    g = frame.gravity(vehicle.r_n[k[i]]) - 2 * np.cross(frame.w_ie_n, v[i])
-    r[i] += 0.5 * g * dt**2 + _rotated(C_k, inc.dp)
-    v[i] += g * dt + _rotated(C_k, inc.dv)
-    C[i] = exp_so3(-frame.w_ie_n * dt) @ C_k @ inc.dR
-    return r, v, C
+    def _by_imu(self) -> BoolArray:
+        """States (K,) that have attitude and biases, and a recording without gaps until the next state."""
+        t_s, imu = self.vehicle.t_s, self.imu
+        if imu is None or not len(imu.t_s):
+            return np.zeros(len(t_s), bool)
+        before, after = [-np.inf, imu.t_s[0] - preintegration.GAP_S], [imu.t_s[-1] + preintegration.GAP_S, np.inf]
+        missing_s = np.vstack([before, preintegration.gaps(imu), after])
+        estimated = np.isfinite(self.vehicle.q_nb).all(axis=1) & np.isfinite(self.bias).all(axis=1)
+        return np.asarray(estimated & ~preintegration.crossing(missing_s, t_s, np.append(t_s[1:], t_s[-1:])))
 
+    def carried(self, k: IntArray, dt_s: Array) -> tuple[Array, Array, Array]:
+        """r_p, v_p (n, 3) and R_p (n, 3, 3): states k (n,), sorted, after dt_s (n,)."""
+        r, v, R = self.vehicle.r_n[k] + self.vehicle.v_n[k] * dt_s[:, None], self.vehicle.v_n[k], self.R[k]
+        i = np.flatnonzero(self.by_imu[k])
+        if self.imu is None or not len(i):
+            return r, v, R
+        start, dt, R_k = self.vehicle.t_s[k[i]], dt_s[i, None], R[i]
+        inc = preintegration.integrate(self.imu, start, start + dt_s[i], self.bias[k[i]])
+        g = self.frame.gravity(self.vehicle.r_n[k[i]]) - 2 * np.cross(self.frame.w_ie_n, v[i])
+        r[i] += 0.5 * g * dt**2 + _rotated(R_k, inc.dp)
+        v[i] += g * dt + _rotated(R_k, inc.dv)
+        R[i] = exp_so3(-self.frame.w_ie_n * dt) @ R_k @ inc.dR
+        return r, v, R
 
-def _missing(
-    vehicle: VehicleSolution, R: Array, imu: ImuStream | None, has_imu: BoolArray, frame: LocalFrame
-) -> tuple[Array, Array, Array, Array]:
-    """e_r, e_v, phi (K, 3) and T (K,) of the intervals after each state; the last state has none of it."""
-    K = len(vehicle.t_s)
-    e_r, e_v, phi, T = np.zeros((K, 3)), np.zeros((K, 3)), np.zeros((K, 3)), np.ones(K)
-    if K > 1:
-        T[:-1] = np.diff(vehicle.t_s)
-        r, v, C = _carried(vehicle, R, imu, has_imu, frame, np.arange(K - 1), T[:-1])
-        e_r[:-1], e_v[:-1] = vehicle.r_n[1:] - r, vehicle.v_n[1:] - v
-        phi[:-1] = log_so3(np.swapaxes(C, 1, 2) @ R[1:])
-    return e_r, e_v, phi, T
+    def missing(self) -> tuple[Array, Array, Array, Array]:
+        """e_r, e_v, phi (K, 3) and T (K,) of the intervals after each state; nothing is missing after the last."""
+        t_s = self.vehicle.t_s
+        e_r, e_v, phi, T = (np.zeros((len(t_s), *shape)) for shape in ((3,), (3,), (3,), ()))
+        T[:-1], T[-1] = np.diff(t_s), 1.0
+        r, v, R = self.carried(np.arange(len(t_s) - 1), T[:-1])
+        e_r[:-1], e_v[:-1] = self.vehicle.r_n[1:] - r, self.vehicle.v_n[1:] - v
+        phi[:-1] = log_so3(np.swapaxes(R, 1, 2) @ self.R[1:])
+        return e_r, e_v, phi, T
 
 
 def _rotated(C: Array, x: Array) -> Array:
@@ -181,17 +187,18 @@ def _rotated(C: Array, x: Array) -> Array:
     return np.asarray(np.squeeze(C @ x[:, :, None], axis=2))
 
 
-def _times(state_s: Array, rate_hz: float | None, imu: ImuStream | None) -> Array:
+def _times(state_s: Array, rate: Rate, imu: ImuStream | None) -> Array:
     """Times within the states: multiples of 1 / rate, else those of the IMU, else the states'."""
-    if not len(state_s) or (rate_hz is None and imu is None):
+    if not len(state_s):
         return state_s
     first, last = state_s[0], state_s[-1]
-    if rate_hz is None:
-        assert imu is not None
+    if rate == "imu":
+        if imu is None:
+            return state_s
         return np.asarray(imu.t_s[(imu.t_s >= first) & (imu.t_s <= last)])
     # a state on a multiple counts although its time is rounded
-    n = np.arange(np.ceil(first * rate_hz - 1e-6), np.floor(last * rate_hz + 1e-6) + 1)
-    return np.clip(n / rate_hz, first, last)
+    n = np.arange(np.ceil(first * rate - 1e-6), np.floor(last * rate + 1e-6) + 1)
+    return np.clip(n / rate, first, last)
 
 
 def _vehicle_at(vehicle: VehicleSolution, imu: ImuStream | None, frame: LocalFrame, t_s: Array) -> VehicleSolution:
@@ -208,9 +215,9 @@ def _vehicle_at(vehicle: VehicleSolution, imu: ImuStream | None, frame: LocalFra
     )
 
 
-def _pair_at(solution: Solution, pair: PairSolution, imus: dict[str, ImuStream | None], rate_hz: float | None) -> PairSolution:
+def _pair_at(solution: Solution, pair: PairSolution, imus: dict[str, ImuStream | None], rate: Rate) -> PairSolution:
     a, b = imus.get(pair.reference), imus.get(pair.rover)
-    t_s = _times(pair.t_s, rate_hz, b if a is None else a)
+    t_s = _times(pair.t_s, rate, b if a is None else a)
     found = interpolate_pair(solution.vehicle(pair.reference), solution.vehicle(pair.rover), a, b, solution.frame, t_s)
     k = earlier_state(pair.t_s, t_s)
     return replace(

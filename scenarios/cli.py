@@ -82,8 +82,24 @@ def _smooth_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="change a setting, as often as needed")
     parser.add_argument("--no-report", action="store_true", help="write the numbers only")
     parser.add_argument("--figures", action="store_true", help="write figures for print as well (needs matplotlib)")
+    parser.add_argument(
+        "--rate", metavar="imu|HZ", type=_rate, help="rate of the exported trajectories and baselines (that of the states)"
+    )
     _data_option(parser)
     parser.add_argument("--out", metavar="DIR", type=Path, help=f"folder of the results ({OUT_ROOT}{os.sep}FLIGHT)")
+
+
+def _rate(text: str) -> float | str:
+    """A rate in Hz, or "imu"."""
+    if text == "imu":
+        return text
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = 0.0
+    if not 0 < rate < float("inf"):
+        raise argparse.ArgumentTypeError(f"give imu or a rate in Hz, not {text}")
+    return rate
 
 
 def _simulate_options(parser: argparse.ArgumentParser) -> None:

@@ -23,7 +23,7 @@ from rich.table import Table
 from factorgraph import registry
 from factorgraph.errors import InputError
 from factorgraph.measurements import ReadReport
-from factorgraph.problem import Settings
+from factorgraph.problem import NavigationProblem, Settings
 from factorgraph.solution import Solution, Status
 from scenarios import guard
 from scenarios.cli import check_writable, describe_os_error
@@ -107,8 +107,8 @@ def smooth(args: argparse.Namespace) -> int:
     _check_replaceable(args.out / SOLUTION)
     _check_figures(args)
     with _early_end(outputs), Stages(args.trace) as stages:
-        solution = _estimate(args, stages)
-        _write_results(solution, outputs, stages, args)
+        problem, solution = _estimate(args, stages)
+        _write_results(problem, solution, outputs, stages, args)
     _print_summary(solution)
     return _outcome(solution, outputs, stages)
 
@@ -126,7 +126,7 @@ def _check_figures(args: argparse.Namespace) -> None:
         raise InputError("--figures needs matplotlib, which is not installed; try: pip install matplotlib")
 
 
-def _estimate(args: argparse.Namespace, stages: Stages) -> Solution:
+def _estimate(args: argparse.Namespace, stages: Stages) -> tuple[NavigationProblem, Solution]:
     stages("loading the engine")
     registry.create(args.method)  # what is wrong here is told before the files are read
     override(Settings(), args.set)
@@ -138,7 +138,7 @@ def _estimate(args: argparse.Namespace, stages: Stages) -> Solution:
         _tell_dropped(report, stages)
     problem = dataclasses.replace(flight.problem, settings=override(flight.problem.settings, args.set))
     stages("solving")
-    return registry.solve(problem, args.method, stages)
+    return problem, registry.solve(problem, args.method, stages)
 
 
 def _tell_dropped(report: ReadReport, stages: Stages) -> None:
@@ -149,13 +149,17 @@ def _tell_dropped(report: ReadReport, stages: Stages) -> None:
         stages.say(f"{report.source}: {note}")
 
 
-def _write_results(solution: Solution, outputs: Outputs, stages: Stages, args: argparse.Namespace) -> None:
+def _write_results(
+    problem: NavigationProblem, solution: Solution, outputs: Outputs, stages: Stages, args: argparse.Namespace
+) -> None:
+    from factorgraph.interpolation import resample
     from scenarios import solutions, writers
 
     stages("writing the results")
     text = json.dumps(summary(solution), indent=1, ensure_ascii=False) + "\n"
     outputs.write(SOLUTION, lambda path: solutions.save(solution, path))
-    outputs.write("export", lambda path: writers.write_all(solution, path))
+    exported = solution if args.rate is None else resample(solution, problem, args.rate)
+    outputs.write("export", lambda path: writers.write_all(exported, path))
     outputs.write("summary.json", lambda path: solutions.replace_with(path, lambda part: part.write_text(text, encoding="utf-8")))
     if not args.no_report:
         stages("writing the report")

@@ -103,15 +103,17 @@ def pair_errors(pair: PairSolution) -> list[ErrorSeries]:
 
 
 def vehicle_errors(vehicle: VehicleSolution) -> list[ErrorSeries]:
-    """Position, velocity and attitude errors of a vehicle at the times of its truth.
+    """Position, velocity and attitude errors of a vehicle, at the times of whichever is sparser, its states or its truth.
 
-    The estimate is brought to those times: position by cubic Hermite interpolation with its velocity, velocity
-    linearly, attitude along the shortest rotation, covariances linearly. Truth outside the solution or inside a
-    gap of it is left out. Empty without truth, for base stations, and with fewer than two epochs.
+    The denser of the two is interpolated: position by cubic Hermite interpolation with its velocity (linearly where
+    there is none), velocity linearly, attitude along the shortest rotation, covariances linearly. What lies outside the
+    other or inside a gap of it is left out. Empty without truth, for base stations, and with fewer than two epochs.
     """
     truth = vehicle.truth
     if truth is None or vehicle.is_fixed or len(vehicle.t_s) < 2:
         return []
+    if len(truth.t_s) > 2 and np.median(np.diff(truth.t_s)) < np.median(np.diff(vehicle.t_s)):
+        truth = _thinned(truth, vehicle.t_s)
     usable = _covered(vehicle.t_s, truth.t_s)
     if not usable.any():
         return []
@@ -290,6 +292,18 @@ def _slerp(q: Array, index: IntArray, fraction: Array) -> Array:
     weights = [f * np.sinc(f * angle / np.pi) / whole for f in (1 - fraction, fraction)]
     turned: Array = weights[0][:, None] * start + weights[1][:, None] * end
     return turned
+
+
+def _thinned(truth: Truth, t_s: Array) -> Truth:
+    """Truth at those of the times t_s that it covers."""
+    t = t_s[_covered(truth.t_s, t_s)]
+    index, fraction = _bracket(truth.t_s, t)
+    if truth.v_n is not None and np.isfinite(truth.v_n).all() and np.isfinite(truth.r_n).all():
+        r_n = CubicHermiteSpline(truth.t_s, truth.r_n, truth.v_n)(t)
+    else:
+        r_n = _lerp(truth.r_n, index, fraction)
+    v_n = None if truth.v_n is None else _lerp(truth.v_n, index, fraction)
+    return Truth(t, r_n, v_n, None if truth.q_nb is None else _slerp(truth.q_nb, index, fraction))
 
 
 def _attitude_error(vehicle: VehicleSolution, truth: Truth, usable: BoolArray) -> Array:

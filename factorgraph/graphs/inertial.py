@@ -19,7 +19,7 @@ from factorgraph.graphs.variables import VehicleVariables, key
 from factorgraph.models.preintegration import crossing, gtsam_inputs
 from factorgraph.types import Array
 
-GAP_GYRO, GAP_ACCEL = 1.0, 10.0  # rad/s and m/s^2 per sqrt(Hz)
+GAP_GYRO, GAP_ACCEL = 0.3, 10.0  # rad/s and m/s^2 per sqrt(Hz)
 INTEGRATION_SIGMA_M = 3e-4  # per sqrt(s): keeps the position pivots of the Cholesky elimination well conditioned
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from factorgraph import geodesy
 from factorgraph.attitude import quat_from_matrix
-from factorgraph.graphs.blocks import KINDS, Block, IonosphereBlock, JointBlock, MotionBlock
+from factorgraph.graphs.blocks import CODE, KINDS, Block, GnssBlock, IonosphereBlock, JointBlock, MotionBlock
 from factorgraph.graphs.build import Built, GnssLink
 from factorgraph.graphs.covariance import JointCovariance
 from factorgraph.graphs.integers import tail_covariance
@@ -351,7 +351,8 @@ def _nis(graph: Graph, cov: JointCovariance | None) -> tuple[Array, Array, Array
     """Sum of squared whitened residuals and its expectation per state time.
 
     E[e^T e] = rows - clocks - trace(J P J^T) for a factor with whitened Jacobian J and posterior covariance P of its
-    variables; rows that robust weights push down count by their weight.
+    variables; rows that robust weights push down do not count. Undifferenced code is left out: its standard deviation
+    stands for errors that persist, so its residuals are small by intention.
     """
     blocks = _measured(graph)
     if not blocks or cov is None:
@@ -361,20 +362,23 @@ def _nis(graph: Graph, cov: JointCovariance | None) -> tuple[Array, Array, Array
     for b in blocks:
         b.whiten()
         starts = b.rows.factor.start
-        sq = b.rows.factor.sum(b.e**2)
-        rows = b.rows.factor.sum((b.w > 0.5).astype(float))
-        k = np.clip(np.searchsorted(t, b.rows.t_s[starts] + 5e-3, side="right") - 1, 0, len(t) - 1)
-        n_clocks = np.zeros(len(starts))
+        counts = np.ones(b.n, bool)
+        if isinstance(b, GnssBlock) and b.reference is None:
+            counts = b.rows.kind != CODE
+        sq = b.rows.factor.sum(np.where(counts, b.e**2, 0.0))
+        expected = b.rows.factor.sum((counts & (b.w > 0.5)).astype(float))
         if b.rows.clocks is not None:
-            np.add.at(n_clocks, b.rows.factor.of_row[b.rows.clocks.start], 1.0)
+            first = b.rows.clocks.start
+            np.subtract.at(expected, b.rows.factor.of_row[first], counts[first].astype(float))
+        k = np.clip(np.searchsorted(t, b.rows.t_s[starts] + 5e-3, side="right") - 1, 0, len(t) - 1)
         keys = [b.keys(f) for f in range(len(starts))]
-        alike = len({len(k) for k in keys}) == 1
-        P = cov.joints(keys) if alike and keys[0] else [cov.joint(k) if k else np.zeros((0, 0)) for k in keys]
+        alike = len({len(each) for each in keys}) == 1
+        P = cov.joints(keys) if alike and keys[0] else [cov.joint(each) if each else np.zeros((0, 0)) for each in keys]
         for f in range(len(starts)):
-            J = np.hstack(b.columns(f))
-            used = float(np.sum((J @ P[f]) * J))
+            i, j = b.slices(f)
+            J = np.hstack(b.columns(f))[counts[i:j]]
             total[k[f]] += sq[f]
-            dof[k[f]] += max(rows[f] - n_clocks[f] - used, 0.0)
+            dof[k[f]] += max(expected[f] - float(np.sum((J @ P[f]) * J)), 0.0)
     seen = dof > 0
     return t[seen], total[seen], dof[seen]
 

@@ -42,7 +42,9 @@ from scenarios.flights.tables import require_file
 
 BASE_TOLERANCE_M = 200.0  # a single-point position is never wrong by more
 BASE_DOUBT_M = 50.0
+SHORT_IMU_S = 2.0
 EPOCHS_LOOKED_AT = 20  # for the single-point position of a base
+MIN_SATELLITES = 4  # for a position
 MIN_COMMON = 5  # satellites two receivers must share to be worth differencing
 
 Stream = TypeVar("Stream", ImuStream, PositionStream, HeightStream, RangeStream, Truth)
@@ -232,12 +234,19 @@ class _Loader:
         info = self.flight.flight
         stream, report = gnss_stream(raw.gnss, self._navigation(), place.t0)
         self.reports.append(report)
+        source = str(self._path(raw.table.gnss.obs))
+        if not np.isfinite(stream.code_m).any():
+            raise InputError(f"{source}: no pseudorange (code) in any row; phase alone gives no position")
         if not np.isfinite(stream.sat_pos_ecef[:, 0]).any():
             raise InputError(
-                f"{self._path(raw.table.gnss.obs)}: the navigation files have no message for any of its satellites and times; "
-                "are they of the same day?"
+                f"{source}: the navigation files have no message for any of its satellites and times; are they of the same day?"
             )
-        stream = _part_of_gnss(stream, info.start_s, info.end_s, str(self._path(raw.table.gnss.obs)))
+        stream = _part_of_gnss(stream, info.start_s, info.end_s, source)
+        if (most := _most_satellites(stream)) < MIN_SATELLITES:
+            raise InputError(
+                f"{source}: at most {most} satellites with code and orbit at a time, a position needs {MIN_SATELLITES}; "
+                "check the navigation files, the systems logged and the antenna's view"
+            )
         return Antenna(stream, raw.lever(raw.table.gnss.lever_b), raw.table.gnss.noise.noise)
 
     def _positions(self, raw: _RawVehicle, place: Place) -> list[PositionStream]:
@@ -297,6 +306,7 @@ class _Loader:
     def _check(self, problem: NavigationProblem) -> None:
         for vehicle in problem.vehicles:
             _check_overlap(vehicle, problem)
+            self._note(vehicle.name, _short_imu(vehicle))
             if vehicle.gnss is not None and vehicle.fixed_n is not None:
                 self._note(vehicle.name, _check_base(vehicle, problem))
         for link in problem.links:
@@ -352,6 +362,13 @@ def approximate_position(stream: GnssStream, t0: GpsTime) -> Array | None:
     point = single_point(few, GnssNoise(), "GREJC", few.klobuchar, t0.sow)
     good = np.isfinite(point.r_ecef).all(axis=1) & (point.rms_m < 100.0)
     return np.median(point.r_ecef[good], axis=0) if good.any() else None
+
+
+def _most_satellites(stream: GnssStream) -> int:
+    """Satellites with code and state, at the epoch with most of them."""
+    known = np.isfinite(stream.code_m) & np.isfinite(stream.sat_pos_ecef[:, 0])
+    pairs = np.unique(np.column_stack([stream.epoch[known], stream.sat[known]]), axis=0)
+    return int(np.bincount(pairs[:, 0], minlength=1).max())
 
 
 # parts of streams
@@ -469,6 +486,20 @@ def _check_overlap(v: Vehicle, problem: NavigationProblem) -> None:
                 )
     if v.truth is not None and v.truth.t_s.size and spans and all(_apart(s, (v.truth.t_s[0], v.truth.t_s[-1])) for _, s in spans):
         raise InputError(f"vehicle {v.name}: truth ({_as_span((v.truth.t_s[0], v.truth.t_s[-1]))}) does not overlap its sensors")
+
+
+def _short_imu(v: Vehicle) -> str:
+    """A note where the IMU leaves out part of what the vehicle's other sensors measured."""
+    others = [span for name, span in _spans(v) if name != "imu"]
+    if v.imu is None or not others:
+        return ""
+    first, last = min(s[0] for s in others), max(s[1] for s in others)
+    start, end = float(v.imu.t_s[0]), float(v.imu.t_s[-1])
+    lost_s = max(start - first, 0.0) + max(last - end, 0.0)
+    if lost_s < SHORT_IMU_S:
+        return ""
+    spans = f"the IMU ({_as_span((start, end))}) is short of the other sensors ({_as_span((first, last))})"
+    return f"{spans}; {lost_s:.1f} s are left out"
 
 
 def _check_ranges(model: RangeModel, problem: NavigationProblem) -> None:

@@ -27,8 +27,10 @@ from scenarios.flights.schema import STANDARD_GRAVITY, axes_matrix
 from scenarios.flights.tables import RawTable, Times, ordered, read_columns, read_times, time_columns
 
 G = 9.8
+MAX_DISTANCE_M = 1e6  # of position fixes from the local origin
 DEFAULT_SIGMA_M = (3.0, 3.0, 6.0)  # of position fixes that state none
 MAX_RATE_RPS = 40.0  # no gyroscope of a vehicle measures more (2300 deg/s)
+MAX_FORCE = 100.0  # times the median
 SAME_S = 1e-3  # two logs of one ranging exchange agree to this
 
 
@@ -112,10 +114,24 @@ def imu_stream(raw: Raw, imu: schema.Imu, place: Place) -> tuple[ImuStream, Read
     w = table.stack(imu.gyro) * (np.pi / 180 if imu.gyro_unit == "deg/s" else 1.0)
     t = raw.times.since(place.t0)
     keep, dropped = ordered(t, np.hstack([f, w]), source)
+    wild = keep & _wild(f, w, keep)
+    keep &= ~wild
+    if wild.any():
+        dropped["beyond what an IMU measures"] = int(wild.sum())
+    if keep.sum() < 2:
+        raise InputError(f"{source}: {int(keep.sum())} usable row; an IMU needs two at least")
     C_bs = imu.C_bs
     stream = ImuStream(t[keep], f[keep] @ C_bs.T, w[keep] @ C_bs.T, imu.is_mean)
     notes = _check_gravity(stream, f[keep], w[keep], imu, source)
     return stream, ReadReport(source, len(stream.t_s), {**table.dropped, **dropped}, notes)
+
+
+def _wild(f: Array, w: Array, among: BoolArray) -> BoolArray:
+    """Single samples (n,) that cannot be; where most are so, units and columns are wrong, which is told elsewhere."""
+    size, rate = np.linalg.norm(f, axis=1), np.linalg.norm(w, axis=1)
+    too_fast = rate > MAX_RATE_RPS
+    rates_fit = np.percentile(rate[among], 99.0) <= MAX_RATE_RPS
+    return np.asarray((size > MAX_FORCE * np.median(size[among])) | (too_fast & rates_fit))
 
 
 def _check_gravity(stream: ImuStream, f_s: Array, w_s: Array, imu: schema.Imu, source: str) -> tuple[str, ...]:
@@ -191,6 +207,11 @@ def position_stream(raw: Raw, p: schema.Positions, lever_b: Vec3, place: Place, 
     sigma = _position_sigma(raw, p, place, len(r_n))
     t = raw.times.since(place.t0)
     keep, more = ordered(t, np.hstack([r_n, sigma]), str(path))
+    far_m = float(np.median(np.linalg.norm(r_n[keep], axis=1)))
+    if far_m > MAX_DISTANCE_M:
+        raise InputError(
+            f"{path}: positions are {far_m / 1e3:.4g} km from the local origin; check position, frame and the flight's origin"
+        )
     stream = PositionStream(t[keep], r_n[keep], np.maximum(sigma[keep], 1e-4), lever_b, p.name)
     return stream, ReadReport(str(path), len(stream.t_s), {**dropped, **more})
 
@@ -375,18 +396,19 @@ def range_stream(
     finite = np.isfinite(t) & np.isfinite(r) & np.isfinite(sigma) & (sigma > 0)
     declared = (a >= 0) & (b >= 0) & (a != b)
     usable = finite & declared & (r > 0)
-    if not usable.any():
-        hint = f"; the file has tags {', '.join(sorted(unknown)[:10])}" if unknown else ""
-        raise InputError(f"{source}: no range between declared tags ({', '.join(index)}){hint}")
-    order = np.flatnonzero(usable)[np.argsort(t[usable], kind="stable")]
-    again = _logged_twice(t[order], r[order], np.sort(np.column_stack([a[order], b[order]]), axis=1))
-    kept = order[~again]
     counts = {
         "with empty or non-numeric cells": int(np.sum(~finite)),
         "between tags that are not declared": int(np.sum(finite & ~declared)),
         "not positive": int(np.sum(finite & declared & ~(r > 0))),
-        "logged twice": int(again.sum()),
     }
+    if not usable.any():
+        found = ", ".join(f"{n} {reason}" for reason, n in counts.items() if n)
+        hint = f"; the file has tags {', '.join(sorted(unknown)[:10])}" if unknown else f": {found}"
+        raise InputError(f"{source}: no range between declared tags ({', '.join(index)}){hint}")
+    order = np.flatnonzero(usable)[np.argsort(t[usable], kind="stable")]
+    again = _logged_twice(t[order], r[order], np.sort(np.column_stack([a[order], b[order]]), axis=1))
+    kept = order[~again]
+    counts["logged twice"] = int(again.sum())
     dropped = {reason: n for raw in raws for reason, n in _the_table(raw).dropped.items()}
     dropped |= {reason: n for reason, n in counts.items() if n}
     stream = RangeStream(t[kept], a[kept], b[kept], tags, r[kept], sigma[kept], ranges.name)

@@ -31,6 +31,8 @@ UNIX_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 UNIX_TO_GPS_S = (GPS_EPOCH - UNIX_EPOCH).total_seconds()
 NULLS = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None", "none"]
 PROBE_LINES = 200  # lines looked at for the number of columns
+PROBE_BYTES = 1 << 16  # looked at for what is not text
+NOT_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 
 Names = np.ndarray[tuple[int], np.dtype[np.str_]]
 
@@ -112,7 +114,7 @@ def read_columns(
 
 
 def _read_csv(path: Path, options: TextOptions, numbers: list[str | int], texts: list[str | int]) -> RawTable:
-    data, delimiter, first_line = _plain_text(read_bytes(path), options)
+    data, delimiter, first_line = _plain_text(_text(path), options)
     names, n_columns = _layout(data, delimiter, options, path)
     where = {column: _index(column, names, n_columns, path) for column in (*numbers, *texts)}
     invalid: list[int] = []
@@ -150,6 +152,15 @@ def _read_csv(path: Path, options: TextOptions, numbers: list[str | int], texts:
     return RawTable(path, n_rows, values, {c: _as_text(table[keys[where[c]]]) for c in texts}, dropped)
 
 
+def _text(path: Path) -> bytes:
+    data = read_bytes(path)
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise InputError(f"{path}: UTF-16 text; save it as UTF-8")
+    if NOT_TEXT.search(data[:PROBE_BYTES]):
+        raise InputError(f"{path}: not a text file, where columns of numbers are needed")
+    return data
+
+
 def _plain_text(data: bytes, options: TextOptions) -> tuple[bytes, str, int]:
     """Text without byte-order mark, skipped lines and comments, one-character delimiter, line number of its start."""
     data = data.removeprefix(b"\xef\xbb\xbf")
@@ -165,7 +176,7 @@ def _plain_text(data: bytes, options: TextOptions) -> tuple[bytes, str, int]:
 
 def _layout(data: bytes, delimiter: str, options: TextOptions, path: Path) -> tuple[list[str], int]:
     """Column names (empty without a header) and number of columns."""
-    head = data[: 1 << 16].decode("utf-8", "replace").splitlines()[:PROBE_LINES]
+    head = data[:PROBE_BYTES].decode("utf-8", "replace").splitlines()[:PROBE_LINES]
     if len(delimiter) != 1:
         raise InputError(f'{path}: delimiter {delimiter!r} must be one character or "whitespace"')
     rows = [row for row in csv.reader(head, delimiter=delimiter) if row]

@@ -17,7 +17,7 @@ import pytest
 from factorgraph.errors import InputError
 from factorgraph.problem import Settings
 from factorgraph.solution import Solution
-from scenarios import cli, demo, guard
+from scenarios import cli, demo, guard, solutions
 from scenarios.metrics import summary_rows
 from scenarios.overrides import override
 from tests.helpers import ROOT
@@ -125,6 +125,8 @@ def test_every_command_and_option_is_documented() -> None:
         (["smooth"], "FLIGHT"),
         (["smooth", "a", "--metod=graph"], "unknown argument --metod=graph, did you mean --method?"),
         (["smooth", "a", "b"], "unknown argument b"),
+        (["smooth", "a", "--rate", "fast"], "--rate: give imu or a rate in Hz, not fast"),
+        (["smooth", "a", "--rate=-5"], "--rate: give imu or a rate in Hz, not -5"),
         (["simulate", "two-uav"], "OUT"),
         (["simulate", "two-uav", "out", "--seed", "x"], "--seed"),
         (["report"], "SOLUTION"),
@@ -190,6 +192,21 @@ def test_a_saved_solution_gives_its_report_again(flight: Path) -> None:
     for folder in (out, out / "solution"):
         assert cli.main(["report", str(folder)]) == guard.DONE
         (out / "report.html").unlink()
+
+
+@pytest.mark.usefixtures("plugins", "unguarded")
+def test_a_rate_changes_the_export_and_not_the_solution(flight: Path) -> None:
+    out = flight / "out"
+    argv = ["smooth", str(flight), "--method", "example", "--no-report", "--out", str(out)]
+    rows = {}
+    for rate in ([], ["--rate", "4"], ["--rate", "imu"]):
+        assert cli.main([*argv, *rate]) == guard.DONE
+        lines = [len(path.read_text("utf-8").splitlines()) for path in (out / "export").glob("[vp]*-*.csv")]
+        rows[" ".join(rate)] = lines
+        assert len(solutions.load(out / "solution").vehicles[0].t_s) == 60
+    assert set(rows[""]) == {61}
+    assert set(rows["--rate 4"]) == {1 + 59 * 4 + 1}
+    assert rows["--rate imu"] == rows[""]  # no vehicle of this flight has one
 
 
 @pytest.mark.usefixtures("unguarded")
