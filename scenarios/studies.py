@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 
 from factorgraph import registry
+from factorgraph.consistency import nees
 from factorgraph.solution import Fix, Solution
 from factorgraph.types import Array, IntArray
 from scenarios.simulate import Scenario, SimulatedFlight, load_scenario, simulate
@@ -36,7 +37,7 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True)
-class Consistency:
+class Trials:
     """Trials of one scenario and method."""
 
     scenario: str
@@ -73,7 +74,7 @@ def run(
     workers: int = 1,
     progress: Callable[[int], None] | None = None,
     duration_s: float | None = None,
-) -> Consistency:
+) -> Trials:
     """Simulate and solve one flight per seed. `duration_s` shortens the scenario; `progress` hears of finished trials."""
     one = partial(trial, scenario, method, duration_s)
     done: list[Trial] = []
@@ -82,13 +83,13 @@ def run(
             done.append(one(seed))
             if progress is not None:
                 progress(len(done))
-        return Consistency(scenario, method, tuple(done))
+        return Trials(scenario, method, tuple(done))
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
         for result in pool.map(one, seeds):
             done.append(result)
             if progress is not None:
                 progress(len(done))
-    return Consistency(scenario, method, tuple(done))
+    return Trials(scenario, method, tuple(done))
 
 
 def trial(scenario: str, method: str, duration_s: float | None, seed: int) -> Trial:
@@ -109,7 +110,7 @@ def trial(scenario: str, method: str, duration_s: float | None, seed: int) -> Tr
         seed=seed,
         t_s=pair.t_s,
         error_enu=error,
-        nees=np.einsum("ki,ki->k", error, np.linalg.solve(pair.P[:, :3, :3], error[..., None])[..., 0]),
+        nees=nees(error, pair.P[:, :3, :3]),
         bound_m2=np.trace(bound[:, :3, :3], axis1=1, axis2=2),
         fix=pair.fix,
         wrong_epochs=wrong_epochs(flight, solution),

@@ -23,7 +23,7 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
 from factorgraph.attitude import euler_from_matrix, matrix_from_quat
-from factorgraph.geodesy import C_en, LocalFrame, geodetic_from_ecef
+from factorgraph.geodesy import LocalFrame, geodetic_from_ecef
 from factorgraph.gpstime import WEEK_S, GpsTime
 from factorgraph.solution import ATT, BA, BG, POS, VEL, Fix, PairSolution, Solution, VehicleSolution
 from factorgraph.types import Array, IntArray
@@ -169,7 +169,7 @@ def write_pos(solution: Solution, vehicle: str, path: Path) -> None:
     """Latitude, longitude and ellipsoidal height of a vehicle, with standard deviations north, east, up."""
     v = solution.vehicle(vehicle)
     lat, lon, h = geodetic_from_ecef(solution.frame.to_ecef(v.r_n))
-    C = C_en(lat, lon) @ solution.frame.C_en.T
+    C = solution.frame.C_to_enu(v.r_n)
     P = C @ v.P[:, POS, POS] @ np.swapaxes(C, 1, 2)
     quality, n_sat, ratio = _quality(solution, v)
     sd = _deviations(P[:, [[1], [0], [2]], [1, 0, 2]])

@@ -11,11 +11,13 @@ with robust weights w_i per row, never per factor.
 from __future__ import annotations
 
 import itertools
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
+from numba import njit
 
 from factorgraph.graphs.variables import Query, VehicleVariables
 from factorgraph.models.differencing import CommonGroups
@@ -47,7 +49,7 @@ class Rows:
 
 
 @dataclass(slots=True)
-class Block:
+class Block(ABC):
     """Base of all blocks; subclasses say how rows are predicted."""
 
     rows: Rows
@@ -68,19 +70,19 @@ class Block:
     def n(self) -> int:
         return len(self.rows.sigma)
 
+    @abstractmethod
     def keys(self, f: int) -> list[int]:
         """GTSAM keys of factor f, in the order of the columns."""
-        raise NotImplementedError
 
+    @abstractmethod
     def widths(self) -> tuple[int, ...]:
         """Column counts of those keys."""
-        raise NotImplementedError
 
+    @abstractmethod
     def predict(self) -> None:
         """Set y and J at the current variables."""
-        raise NotImplementedError
 
-    def refresh(self) -> None:
+    def refresh(self) -> None:  # noqa: B027 - most blocks have nothing to renew
         """Renew what depends on the preintegration bias."""
 
     def normalised(self) -> Array:
@@ -110,9 +112,9 @@ class Block:
                 self.w[mine] = robust_weight(robust[name], t[mine])
 
     def cost(self, robust: dict[str, Robust]) -> float:
-        """Robust cost at the current residuals; the clock means use the current weights."""
+        """Robust cost at the current residuals; the clock means use the current weights. Priors (kind -1) are quadratic."""
         r = self.residuals() / self.rows.sigma
-        total = 0.0
+        total = 0.5 * float(np.sum(r[self.rows.kind < 0] ** 2))
         for index, name in enumerate(KINDS):
             mine = self.active & (self.rows.kind == index)
             if np.any(mine):
@@ -200,7 +202,7 @@ class PositionBlock(Block):
         return self.end.dims
 
     def predict(self) -> None:
-        p = self.end.vehicle.points(self.end.query)
+        p = self.end.vehicle.points(self.end.query, velocity=False)
         self.y = (self.z_n - p.r_n).ravel()
         self.J = p.J_r.reshape(self.n, -1)
 
@@ -222,7 +224,7 @@ class HeightBlock(Block):
         return self.end.dims
 
     def predict(self) -> None:
-        p = self.end.vehicle.points(self.end.query)
+        p = self.end.vehicle.points(self.end.query, velocity=False)
         self.y = self.z_m - p.r_n[:, 2]
         self.J = p.J_r[:, 2, :]
 
@@ -255,9 +257,9 @@ class RangeBlock(Block):
         return own if self.parameter is None else (*own, 2)
 
     def predict(self) -> None:
-        pa = self.a.vehicle.points(self.a.query)
+        pa = self.a.vehicle.points(self.a.query, velocity=False)
         if self.b is not None:
-            pb = self.b.vehicle.points(self.b.query)
+            pb = self.b.vehicle.points(self.b.query, velocity=False)
             d, others = pa.r_n - pb.r_n, [-pb.J_r]
         else:
             assert self.anchor_n is not None
@@ -342,6 +344,68 @@ class JointBlock(Block):
         self.y, self.J = np.zeros(self.n), np.zeros((self.n, sum(self.widths())))
 
 
+@dataclass(frozen=True, slots=True)
+class ScalarColumns:
+    """Columns of a block's scalar variables, sparse: entry e says row `row[e]` has `scale[e]` in local column `column[e]`.
+
+    The whitened and projected columns of factor f are a dense Fortran-ordered piece of `dense`.
+    """
+
+    row: IntArray  # (e,) sorted
+    column: IntArray  # (e,) within the factor
+    scale: Array  # (e,)
+    keys: IntArray  # (sum of widths,) factor after factor
+    first_key: IntArray  # (factors + 1,)
+    start: IntArray  # (factors + 1,) rows of the factors
+    first: IntArray  # (factors + 1,) into dense
+    dense: Array
+
+    @classmethod
+    def of(cls, row: IntArray, key: IntArray, scale: Array, factor: CommonGroups, n: int) -> ScalarColumns:
+        start = np.concatenate([factor.start, [n]]).astype(np.int64)
+        order = np.lexsort((key, factor.of_row[row])) if len(row) else np.zeros(0, np.int64)
+        f, k = factor.of_row[row][order], key[order]
+        new = np.concatenate([[True], (f[1:] != f[:-1]) | (k[1:] != k[:-1])]) if len(row) else np.zeros(0, bool)
+        widths = np.bincount(f[new], minlength=len(factor.start))
+        first_key = np.concatenate([[0], np.cumsum(widths)]).astype(np.int64)
+        column = np.empty(len(row), np.int64)
+        column[order] = np.cumsum(new) - 1 - first_key[f]
+        by_row = np.argsort(row, kind="stable")
+        first = np.concatenate([[0], np.cumsum(widths * np.diff(start))]).astype(np.int64)
+        return cls(row[by_row], column[by_row], scale[by_row], k[new], first_key, start, first, np.zeros(first[-1]))
+
+    def matrix(self, f: int) -> Array:
+        """View (rows, width) of factor f's columns."""
+        rows = int(self.start[f + 1] - self.start[f])
+        return self.dense[self.first[f] : self.first[f + 1]].reshape(-1, rows).T
+
+
+@njit(cache=True)
+def _project_entries(row, column, scale, u, clock, clock_start, factor, start, first, dense):  # type: ignore[no-untyped-def]
+    """dense = P diag(u) C for the sparse columns C, P of models.differencing."""
+    dense[:] = 0.0
+    n = len(u)
+    for e in range(len(row)):
+        j = row[e]
+        g, f = clock[j], factor[j]
+        a = clock_start[g]
+        b = clock_start[g + 1] if g + 1 < len(clock_start) else n
+        total = 0.0
+        for i in range(a, b):
+            total += u[i] * u[i]
+        base = first[f] + column[e] * (start[f + 1] - start[f]) - start[f]
+        dense[base + j] += u[j] * scale[e]
+        if total > 0:
+            share = scale[e] * u[j] * u[j] / total
+            for i in range(a, b):
+                dense[base + i] -= u[i] * share
+
+
+def project_entries(c: ScalarColumns, u: Array, clocks: CommonGroups, factor: CommonGroups) -> None:
+    """Fill the whitened and projected columns of every factor."""
+    _project_entries(c.row, c.column, c.scale, u, clocks.of_row, clocks.start, factor.of_row, c.start, c.first, c.dense)
+
+
 @dataclass(slots=True)
 class GnssBlock(Block):
     """Code, phase and Doppler of a receiver, or their differences rover - reference. One factor per epoch.
@@ -366,9 +430,7 @@ class GnssBlock(Block):
     iono_scale: Array = field(init=False)  # (n,) metres of this row per metre of it
     iono_key: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     iono_value: Array = field(default_factory=lambda: np.zeros(0))  # vertical at L1, rover minus reference [m]
-    scalar_cache: dict[int, tuple[list[int], Array]] = field(
-        default_factory=dict
-    )  # structure of each factor, until factors are renewed
+    scalar_columns: ScalarColumns | None = None  # until factors are renewed
 
     def __post_init__(self) -> None:
         Block.__post_init__(self)
@@ -379,44 +441,58 @@ class GnssBlock(Block):
 
     def keys(self, f: int) -> list[int]:
         own = [k for end in self._ends() for k in end.keys(f)]
-        return [*own, *self.scalars(f)[0]]
-
-    def scalars(self, f: int) -> tuple[list[int], Array]:
-        """Keys of the ambiguities and ionospheres in factor f that are variables, and their raw columns (rows, keys)."""
-        if f not in self.scalar_cache:
-            i, j = self.slices(f)
-            arc, iono = self.arc[i:j], self.iono[i:j]
-            arcs = np.array(sorted(set(arc.tolist()) - {-1}), np.int64)
-            arcs = arcs[self.amb_key[arcs] != 0]
-            ionospheres = np.array(sorted(set(iono.tolist()) - {-1}), np.int64)
-            columns = np.hstack(
-                [
-                    np.where(arc[:, None] == arcs, self.wavelength_m[i:j, None], 0.0),
-                    np.where(iono[:, None] == ionospheres, self.iono_scale[i:j, None], 0.0),
-                ]
-            )
-            self.scalar_cache[f] = ([*self.amb_key[arcs].tolist(), *self.iono_key[ionospheres].tolist()], columns)
-        return self.scalar_cache[f]
-
-    def renew(self) -> None:
-        """Call when ambiguities became constants or variables: the factors' keys change with them."""
-        self.scalar_cache.clear()
-        self.made = None
-
-    def _carrier(self, f: int, i: int, j: int, edges: list[tuple[int, int]]) -> gtsam.CustomFactor:
-        if not self.scalars(f)[0]:
-            return Block._carrier(self, f, i, j, edges)
-
-        def error(_factor: gtsam.CustomFactor, _values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-            if jacobians is not None:
-                for slot, column in enumerate(self.columns(f)):
-                    jacobians[slot] = column
-            return self.e[i:j]
-
-        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(j - i), self.keys(f), error)
+        return [*own, *self.scalars(f)]
 
     def widths(self) -> tuple[int, ...]:
         return tuple(d for end in self._ends() for d in end.dims)
+
+    def scalars(self, f: int) -> list[int]:
+        """Keys of the ambiguities and ionospheres of factor f that are variables."""
+        c = self._entries()
+        return [int(k) for k in c.keys[c.first_key[f] : c.first_key[f + 1]]]
+
+    def _entries(self) -> ScalarColumns:
+        if self.scalar_columns is None:
+            arc_free = self.arc >= 0
+            arc_free[arc_free] = self.amb_key[self.arc[arc_free]] != 0
+            a, i = np.flatnonzero(arc_free), np.flatnonzero(self.iono >= 0)
+            row = np.concatenate([a, i])
+            key = np.concatenate([self.amb_key[self.arc[a]], self.iono_key[self.iono[i]]])
+            self.scalar_columns = ScalarColumns.of(
+                row, key, np.concatenate([self.wavelength_m[a], self.iono_scale[i]]), self.rows.factor, self.n
+            )
+        return self.scalar_columns
+
+    def renew(self) -> None:
+        """Call when ambiguities became constants or variables: the factors' keys change with them."""
+        self.scalar_columns = None
+        self.made = None
+
+    def whiten(self) -> None:
+        Block.whiten(self)
+        c = self._entries()
+        if len(c.row):
+            assert self.rows.clocks is not None
+            project_entries(c, self.u, self.rows.clocks, self.rows.factor)
+
+    def _carrier(self, f: int, i: int, j: int, edges: list[tuple[int, int]]) -> gtsam.CustomFactor:
+        c = self._entries()
+        width = int(c.first_key[f + 1] - c.first_key[f])
+        if not width:
+            return Block._carrier(self, f, i, j, edges)
+        own = len(edges)
+        matrix = c.matrix(f)
+
+        def error(_factor: gtsam.CustomFactor, _values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+            if jacobians is not None:
+                Jw = self.Jw[i:j]
+                for slot, (a, b) in enumerate(edges):
+                    jacobians[slot] = Jw[:, a:b]
+                for k in range(width):
+                    jacobians[own + k] = matrix[:, k : k + 1]
+            return self.e[i:j]
+
+        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(j - i), self.keys(f), error)
 
     def predict(self) -> None:
         at = self.point_rover
@@ -449,17 +525,8 @@ class GnssBlock(Block):
         return np.where(is_rate, rate, rho), J
 
     def columns(self, f: int) -> list[Array]:
-        own = Block.columns(self, f)
-        raw = self.scalars(f)[1]
-        if not raw.shape[1]:
-            return own
-        # whiten and project as the block does for its own columns
-        assert self.rows.clocks is not None
-        i, j = self.slices(f)
-        clock = self.rows.clocks.of_row[i:j] - self.rows.clocks.of_row[i]
-        first = np.searchsorted(clock, np.arange(clock[-1] + 1))
-        raw = np.asfortranarray(CommonGroups(first, clock).project(raw, self.u[i:j]))
-        return [*own, *(raw[:, k : k + 1] for k in range(raw.shape[1]))]
+        matrix = self._entries().matrix(f)
+        return [*Block.columns(self, f), *(matrix[:, k : k + 1] for k in range(matrix.shape[1]))]
 
     def refresh(self) -> None:
         for end in self._ends():

@@ -32,16 +32,17 @@ def add_imu_factors(graph: gtsam.NonlinearFactorGraph, vehicle: VehicleVariables
     missing = crossing(vehicle.gaps_s, t[:-1], t[1:])
     middle = vehicle.r[:-1] + 0.5 * vehicle.v[:-1] * np.diff(t)[:, None]
     gravity = vehicle.frame.gravitation(middle) + vehicle.origin_centrifugal()
-    w_ie = vehicle.frame.w_ie_n
+    w_ie, eye = vehicle.frame.w_ie_n, np.eye(3)
+    gyro, accel = eye * noise.gyro_rps_rthz**2, eye * noise.accel_mps2_rthz**2
+    gyro_walk, accel_walk = eye * noise.gyro_bias_walk_rps_rts**2, eye * noise.accel_bias_walk_mps2_rts**2
     for k in range(K - 1):
         params = gtsam.PreintegrationCombinedParams(gravity[k])
         params.setOmegaCoriolis(w_ie)
-        gyro, accel = (GAP_GYRO, GAP_ACCEL) if missing[k] else (noise.gyro_rps_rthz, noise.accel_mps2_rthz)
-        params.setGyroscopeCovariance(np.eye(3) * gyro**2)
-        params.setAccelerometerCovariance(np.eye(3) * accel**2)
-        params.setIntegrationCovariance(np.eye(3) * INTEGRATION_SIGMA_M**2)
-        params.setBiasOmegaCovariance(np.eye(3) * noise.gyro_bias_walk_rps_rts**2)
-        params.setBiasAccCovariance(np.eye(3) * noise.accel_bias_walk_mps2_rts**2)
+        params.setGyroscopeCovariance(eye * GAP_GYRO**2 if missing[k] else gyro)
+        params.setAccelerometerCovariance(eye * GAP_ACCEL**2 if missing[k] else accel)
+        params.setIntegrationCovariance(eye * INTEGRATION_SIGMA_M**2)
+        params.setBiasOmegaCovariance(gyro_walk)
+        params.setBiasAccCovariance(accel_walk)
         bias = gtsam.imuBias.ConstantBias(vehicle.bias[k, 3:], vehicle.bias[k, :3])
         pim = gtsam.PreintegratedCombinedMeasurements(params, bias)
         for i in range(inputs.first[k], inputs.first[k + 1]):

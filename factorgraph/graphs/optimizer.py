@@ -15,12 +15,13 @@ import gtsam
 import numpy as np
 
 from factorgraph.graphs.blocks import Block, GnssBlock, RangeBlock
-from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.graphs.variables import ValueTable, VehicleVariables
 from factorgraph.problem import Robust
 from factorgraph.solution import Status
 from factorgraph.types import Array, IntArray
 
 LAMBDA_START, LAMBDA_MAX = 1e-4, 1e8
+PIVOT_MIN = 1e-13  # relative to its row
 DIMENSION = {"x": 6, "b": 6, "p": 3, "v": 3, "a": 1, "i": 1, "s": 2}  # of a variable, by the letter of its key
 
 
@@ -77,8 +78,9 @@ class Graph:
     def take(self, values: gtsam.Values) -> None:
         """Make `values` current and evaluate every block there."""
         self.values = values
+        table = ValueTable.of(values, self.vehicles)
         for vehicle in self.vehicles:
-            vehicle.extract(values)
+            vehicle.extract(values, table)
         for gnss in self.gnss:
             for i, k in enumerate(gnss.amb_key):
                 if k and values.exists(int(k)):
@@ -111,6 +113,7 @@ class Graph:
         return eliminate(linear, self.ordering(linear))
 
     def ordering(self, linear: gtsam.GaussianFactorGraph) -> gtsam.Ordering:
+        """COLAMD with ambiguities and range parameters last."""
         if self.last:
             return gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, self.last)
         return gtsam.Ordering.ColamdGaussianFactorGraph(linear)
@@ -130,9 +133,20 @@ def eliminate(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gt
         return linear.eliminateSequential(ordering)
     except RuntimeError:
         try:
-            return linear.eliminateSequential(ordering, gtsam.EliminateQR)
+            net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
         except RuntimeError:
             return None
+        return net if _has_full_rank(net) else None
+
+
+def _has_full_rank(net: gtsam.GaussianBayesNet) -> bool:
+    """Whether every pivot stands out from the rounding of its row; QR itself never complains."""
+    for i in range(net.size()):
+        c = net.at(i)
+        R = c.R()
+        if np.any(np.abs(np.diag(R)) <= PIVOT_MIN * np.abs(np.hstack([R, c.S()])).max(axis=1)):
+            return False
+    return True
 
 
 def _damped(linear: gtsam.GaussianFactorGraph, lam: float) -> gtsam.GaussianFactorGraph:
@@ -149,7 +163,8 @@ def optimise(
     """Minimise the robust cost from the current values; the result's Bayes net belongs to the last linearisation.
 
     Converged when the cost falls by less than `tolerance` of itself (plus an absolute 1e-6). The steps are Gauss-Newton
-    while the cost falls; otherwise Levenberg-Marquardt with damping relative to unit information.
+    while the cost falls; otherwise Levenberg-Marquardt with damping relative to unit information. A problem that only damping
+    makes solvable ends as singular, without a Bayes net.
     """
     graph.take(graph.values)
     for block in graph.blocks:
@@ -157,15 +172,19 @@ def optimise(
     cost = graph.cost(robust)
     costs = [cost]
     lam = 0.0
-    net = None
+    net, order = None, None
+    singular = False
     for iteration in range(max_iterations):
         for block in graph.blocks:
             block.reweight(robust)
         linear = graph.linearize()
-        order = graph.ordering(linear)
+        if order is None:
+            order = graph.ordering(linear)
         before = graph.values
         while True:
             net = eliminate(linear if lam == 0 else _damped(linear, lam), order)
+            if lam == 0:
+                singular = net is None
             if net is not None:
                 graph.take(before.retract(net.optimize()))
                 new = graph.cost(robust)
@@ -182,5 +201,5 @@ def optimise(
         costs.append(cost)
         progress(iteration + 1, cost)
         if lam == 0.0 and decrease < tolerance * cost + 1e-6:
-            return Result(Status.CONVERGED, costs, net)
+            return Result(Status.SINGULAR, costs) if singular else Result(Status.CONVERGED, costs, net)
     return Result(Status.MAX_ITERATIONS, costs, net)

@@ -9,7 +9,6 @@ from importlib.metadata import PackageNotFoundError, version
 import gtsam
 import numpy as np
 
-from factorgraph import geodesy
 from factorgraph.attitude import quat_from_matrix
 from factorgraph.graphs.blocks import CODE, KINDS, Block, GnssBlock, IonosphereBlock, JointBlock, MotionBlock
 from factorgraph.graphs.build import Built, GnssLink
@@ -183,8 +182,7 @@ def _pair(
 
 def _enu_at(problem: NavigationProblem, v: VehicleVariables) -> Array:
     """Rotations (K, 3, 3) from n to east-north-up at the vehicle."""
-    lat, lon, _ = geodesy.geodetic_from_ecef(problem.frame.to_ecef(v.r))
-    return geodesy.C_en(lat, lon) @ problem.frame.C_en.T
+    return problem.frame.C_to_enu(v.r)
 
 
 def pair_covariance(problem: NavigationProblem, a: VehicleVariables, b: VehicleVariables, cov: JointCovariance) -> Array:

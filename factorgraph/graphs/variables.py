@@ -63,6 +63,31 @@ class Point:
     J_v: Array  # (n, 3, w)
 
 
+@dataclass(frozen=True, slots=True)
+class ValueTable:
+    """Poses, positions and velocities of all vehicles as GTSAM hands them out: sorted by vehicle, then state."""
+
+    poses: Array  # (n, 12) rotation row by row, translation
+    positions: Array  # (n, 3)
+    velocities: Array  # (n, 3)
+    first: dict[int, int]  # vehicle -> first row of its velocities
+    first_pose: dict[int, int]
+    first_position: dict[int, int]
+
+    @classmethod
+    def of(cls, values: gtsam.Values, vehicles: list[VehicleVariables]) -> ValueTable:
+        starts: dict[str, dict[int, int]] = {}
+        for mode, kinds in (("any", ("imu", "motion")), ("imu", ("imu",)), ("motion", ("motion",))):
+            at = 0
+            starts[mode] = {}
+            for v in sorted(vehicles, key=lambda v: v.index):
+                starts[mode][v.index] = at
+                at += len(v.t_s) if v.mode in kinds else 0
+        extract = gtsam.utilities.extractVectors
+        poses = gtsam.utilities.extractPose3(values)
+        return cls(poses, extract(values, "p"), extract(values, "v"), starts["any"], starts["imu"], starts["motion"])
+
+
 class VehicleVariables:
     """One vehicle on the grid: current trajectory, keys, and how points follow from it."""
 
@@ -76,6 +101,8 @@ class VehicleVariables:
         self.R = np.tile(np.eye(3), (K, 1, 1))
         self.bias = np.zeros((K, 6))  # gyroscope, accelerometer
         self.preintegrated_bias = np.zeros((K, 6))
+        letters = {"imu": "xvb", "motion": "pv", "fixed": ""}[self.mode]
+        self._keys = [tuple(key(letter, index, k) for letter in letters) for k in range(K)]
         self.gaps_s = preintegration.gaps(self.imu) if self.mode == "imu" else np.zeros((0, 2))
 
     @property
@@ -85,11 +112,7 @@ class VehicleVariables:
 
     def keys(self, k: int) -> tuple[int, ...]:
         """Keys of state k in the order of the local columns."""
-        if self.mode == "imu":
-            return key("x", self.index, k), key("v", self.index, k), key("b", self.index, k)
-        if self.mode == "motion":
-            return key("p", self.index, k), key("v", self.index, k)
-        return ()
+        return self._keys[k]
 
     @property
     def dims(self) -> tuple[int, ...]:
@@ -146,8 +169,8 @@ class VehicleVariables:
         """g - 2 w_ie x v at states k (n, 3)."""
         return self.frame.gravity(self.r[k]) - 2 * np.cross(self.frame.w_ie_n, self.v[k])
 
-    def points(self, q: Query) -> Point:
-        """Observed points at the current trajectory."""
+    def points(self, q: Query, velocity: bool = True) -> Point:
+        """Observed points at the current trajectory; without `velocity` v_n and J_v are left zero."""
         n = len(q.k)
         if self.mode == "fixed":
             return Point(self.r[q.k], np.zeros((n, 3)), np.zeros((n, 3, 0)), np.zeros((n, 3, 0)))
@@ -164,25 +187,28 @@ class VehicleVariables:
             J_r, J_v = np.zeros((n, 3, 9)), np.zeros((n, 3, 9))
             r = self.r[q.k] + v * dt + np.einsum("nij,nj->ni", R, q.lever_b + w_l * dt)
             J_r[:, :, :3], J_r[:, :, 3:6], J_r[:, :, 6:] = -R @ skew(q.lever_b), R, eye * dt[..., None]
-            J_v[:, :, :3], J_v[:, :, 6:] = -R @ skew(w_l), eye
+            if velocity:
+                J_v[:, :, :3], J_v[:, :, 6:] = -R @ skew(w_l), eye
             return Point(r, v + np.einsum("nij,nj->ni", R, w_l), J_r, J_v)
         inc = q.increments
         db = self.bias[q.k] - self.preintegrated_bias[q.k]
         # up to NEAR_S before its state no increments carry a point, so gravity alone must not: constant velocity and rate
         ahead, behind = np.maximum(dt, 0.0), np.minimum(dt, 0.0)
         dR = inc.dR @ exp_so3(np.einsum("nij,nj->ni", inc.dR_dbg, db[:, :3]) + rate * behind)
-        dv = inc.dv + np.einsum("nij,nj->ni", inc.dv_dbg, db[:, :3]) + np.einsum("nij,nj->ni", inc.dv_dba, db[:, 3:])
         dp = inc.dp + np.einsum("nij,nj->ni", inc.dp_dbg, db[:, :3]) + np.einsum("nij,nj->ni", inc.dp_dba, db[:, 3:])
         g = self.gravity_terms(q.k)
         turn = exp_so3(-self.frame.w_ie_n * ahead)
         Rt = turn @ R @ dR
         r = self.r[q.k] + v * dt + 0.5 * g * ahead**2 + np.einsum("nij,nj->ni", R, dp) + np.einsum("nij,nj->ni", Rt, q.lever_b)
-        vel = v + g * ahead + np.einsum("nij,nj->ni", R, dv) + np.einsum("nij,nj->ni", Rt, w_l)
         lever_k = np.einsum("nij,nj->ni", dR, q.lever_b)
         J_r, J_v = np.zeros((n, 3, 15)), np.zeros((n, 3, 15))
         J_r[:, :, :3], J_r[:, :, 3:6], J_r[:, :, 6:9] = -R @ skew(dp + lever_k), R, eye * dt[..., None]
         J_r[:, :, 9:12] = R @ inc.dp_dba
         J_r[:, :, 12:15] = R @ inc.dp_dbg - Rt @ skew(q.lever_b) @ inc.dR_dbg
+        if not velocity:
+            return Point(r, np.zeros((n, 3)), J_r, J_v)
+        dv = inc.dv + np.einsum("nij,nj->ni", inc.dv_dbg, db[:, :3]) + np.einsum("nij,nj->ni", inc.dv_dba, db[:, 3:])
+        vel = v + g * ahead + np.einsum("nij,nj->ni", R, dv) + np.einsum("nij,nj->ni", Rt, w_l)
         J_v[:, :, :3], J_v[:, :, 6:9] = -R @ skew(dv + np.einsum("nij,nj->ni", dR, w_l)), eye
         J_v[:, :, 9:12] = R @ inc.dv_dba
         J_v[:, :, 12:15] = R @ inc.dv_dbg - Rt @ skew(w_l) @ inc.dR_dbg + Rt @ skew(q.lever_b)
@@ -199,18 +225,18 @@ class VehicleVariables:
             if self.mode != "fixed":
                 values.insert(key("v", self.index, k), self.v[k])
 
-    def extract(self, values: gtsam.Values) -> None:
+    def extract(self, values: gtsam.Values, table: ValueTable) -> None:
         """Take the trajectory from GTSAM values."""
-        for k in range(len(self.t_s)):
-            if self.mode == "imu":
-                pose = values.atPose3(key("x", self.index, k))
-                self.R[k], self.r[k] = pose.rotation().matrix(), pose.translation()
-                b = values.atConstantBias(key("b", self.index, k))
-                self.bias[k, 3:], self.bias[k, :3] = b.accelerometer(), b.gyroscope()
-            elif self.mode == "motion":
-                self.r[k] = values.atVector(key("p", self.index, k))
-            if self.mode != "fixed":
-                self.v[k] = values.atVector(key("v", self.index, k))
+        rows = slice(table.first[self.index], table.first[self.index] + len(self.t_s))
+        if self.mode != "fixed":
+            self.v = table.velocities[rows].copy()
+        if self.mode == "imu":
+            poses = table.poses[table.first_pose[self.index] :][: len(self.t_s)]
+            self.R, self.r = poses[:, :9].reshape(-1, 3, 3).copy(), poses[:, 9:].copy()
+            bias = np.array([values.atConstantBias(keys[2]).vector() for keys in self._keys])
+            self.bias = np.hstack([bias[:, 3:], bias[:, :3]])
+        elif self.mode == "motion":
+            self.r = table.positions[table.first_position[self.index] :][: len(self.t_s)].copy()
 
     def origin_centrifugal(self) -> Array:
         """Centrifugal acceleration at the frame's origin (3,), which GTSAM's Coriolis term leaves out."""

@@ -27,6 +27,7 @@ from scenarios.flights._rinex_observation_header import ObservationHeader, check
 from scenarios.flights._rinex_text import BDT_GPST_S, RinexText, read_rinex
 from scenarios.flights.navigation import Navigation
 from scenarios.flights.signals import SYSTEMS, wavelength_m
+from scenarios.flights.tables import spikes
 
 # Columns of year, month, day, hour, minute, second, event flag, number of records, receiver clock offset.
 EPOCH_3 = np.array([(2, 6), (7, 9), (10, 12), (13, 15), (16, 18), (18, 29), (31, 32), (32, 35), (41, 56)])
@@ -300,10 +301,14 @@ def _located(
 
     t0, t_s = _time_axis(text, header, times)
     impossible = np.isnan(t_s)
-    seen = np.maximum.accumulate(np.where(impossible, -np.inf, t_s))
-    ahead = ~impossible & np.concatenate([[True], np.nan_to_num(t_s[1:], nan=-np.inf) > seen[:-1]])
+    astray = np.zeros(len(t_s), bool)
+    astray[~impossible] = spikes(t_s[~impossible])
+    tally.add("epoch with a time far from its neighbours'", int(astray.sum()))
+    t_s[astray] = np.nan
+    seen = np.maximum.accumulate(np.where(np.isnan(t_s), -np.inf, t_s))
+    ahead = np.isfinite(t_s) & np.concatenate([[True], np.nan_to_num(t_s[1:], nan=-np.inf) > seen[:-1]])
     tally.add("epoch with an impossible date", int(impossible.sum()))
-    tally.add("epoch that repeats or goes back in time", int((~ahead & ~impossible).sum()))
+    tally.add("epoch that repeats or goes back in time", int((~ahead & np.isfinite(t_s)).sum()))
 
     take = readable & known & ahead[epoch]
     filled = np.zeros(len(t_s), bool)

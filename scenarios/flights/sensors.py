@@ -207,11 +207,16 @@ def position_stream(raw: Raw, p: schema.Positions, lever_b: Vec3, place: Place, 
     sigma = _position_sigma(raw, p, place, len(r_n))
     t = raw.times.since(place.t0)
     keep, more = ordered(t, np.hstack([r_n, sigma]), str(path))
-    far_m = float(np.median(np.linalg.norm(r_n[keep], axis=1)))
-    if far_m > MAX_DISTANCE_M:
+    distance_m = np.linalg.norm(r_n, axis=1)
+    far = keep & (distance_m > MAX_DISTANCE_M)
+    if far.sum() > 0.5 * keep.sum():
+        km = float(np.median(distance_m[far])) / 1e3
         raise InputError(
-            f"{path}: positions are {far_m / 1e3:.4g} km from the local origin; check position, frame and the flight's origin"
+            f"{path}: positions are {km:.4g} km from the local origin; check position, frame and the flight's origin"
         )
+    keep &= ~far
+    if far.any():
+        more[f"farther than {MAX_DISTANCE_M / 1e3:g} km from the local origin"] = int(far.sum())
     stream = PositionStream(t[keep], r_n[keep], np.maximum(sigma[keep], 1e-4), lever_b, p.name)
     return stream, ReadReport(str(path), len(stream.t_s), {**dropped, **more})
 
@@ -338,10 +343,11 @@ def _truth_attitude(raw: Raw, truth: schema.TruthTable, C_ba: Array, place: Plac
     if truth.quaternion_order == "xyzw":
         q = q[:, [3, 0, 1, 2]]
     norm = np.linalg.norm(q, axis=1, keepdims=True)
-    wrong = int(np.sum(np.abs(norm - 1) > 0.01))
+    fits = np.abs(norm - 1) <= 0.01
+    wrong = int(np.sum(~fits & np.isfinite(norm)))
     if wrong > 0.5 * len(q):
         raise InputError(f"{raw.table.path}: {wrong} of {len(q)} quaternions are not of unit length; check truth.quaternion")
-    C = matrix_from_quat(np.where(np.abs(norm - 1) > 0.01, np.nan, q / np.where(norm > 0, norm, 1.0)))
+    C = matrix_from_quat(np.where(fits, q, np.nan) / np.where(fits, norm, 1.0))
     return np.asarray(_turn(truth.frame, place) @ C @ C_ba.T)
 
 

@@ -30,8 +30,10 @@ UNIT_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 UNIX_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 UNIX_TO_GPS_S = (GPS_EPOCH - UNIX_EPOCH).total_seconds()
 NULLS = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None", "none"]
+FAR_S, FAR_SPANS = 600.0, 10.0  # a single time stamp further than both from the span of all others is wrong
 PROBE_LINES = 200  # lines looked at for the number of columns
 PROBE_BYTES = 1 << 16  # looked at for what is not text
+MAX_NOT_TEXT = 0.01  # share of bytes: a logger that loses power leaves a few
 NOT_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 
 Names = np.ndarray[tuple[int], np.dtype[np.str_]]
@@ -153,11 +155,17 @@ def _read_csv(path: Path, options: TextOptions, numbers: list[str | int], texts:
 
 
 def _text(path: Path) -> bytes:
+    """Content of a text file as UTF-8. Raises InputError where it is not text."""
     data = read_bytes(path)
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError(f"{path}: UTF-16 text; save it as UTF-8")
-    if NOT_TEXT.search(data[:PROBE_BYTES]):
+    head = data[:PROBE_BYTES]
+    if len(NOT_TEXT.findall(head)) > MAX_NOT_TEXT * len(head):
         raise InputError(f"{path}: not a text file, where columns of numbers are needed")
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        return data.decode("utf-8", "replace").encode()
     return data
 
 
@@ -309,7 +317,7 @@ def ordered(t_s: Array, values: Array, source: str, distinct: bool = True) -> tu
     finite = np.isfinite(t_s) & np.isfinite(values).all(axis=1)
     keep = finite.copy()
     t = t_s[finite]
-    spike = _spikes(t)
+    spike = spikes(t)
     latest = np.maximum.accumulate(np.concatenate([[-np.inf], np.where(spike, -np.inf, t)[:-1]])) if t.size else t
     repeated = (t == latest) & ~spike if distinct else np.zeros(len(t), bool)
     backward = (t < latest) | spike
@@ -330,10 +338,14 @@ def ordered(t_s: Array, values: Array, source: str, distinct: bool = True) -> tu
     return keep, {reason: n for reason, n in counts.items() if n}
 
 
-def _spikes(t: Array) -> BoolArray:
-    """Single time stamps ahead of their successor that fits their predecessor: they, not what follows, are wrong."""
+def spikes(t: Array) -> BoolArray:
+    """Single time stamps that are wrong, not those after them.
+
+    Stamps ahead of a successor that fits their predecessor, and a first or last one far from all the rest.
+    """
     spike = np.zeros(len(t), bool)
     if len(t) > 2:
         spike[1:-1] = (t[1:-1] > t[2:]) & (t[:-2] <= t[2:])
-        spike[0] = t[0] > t[1] and t[0] > t[2]
+        spike[0] = (t[0] > t[1] and t[0] > t[2]) or t[1] - t[0] > max(FAR_S, FAR_SPANS * (t[-1] - t[1]))
+        spike[-1] = not spike[-2] and t[-1] - t[-2] > max(FAR_S, FAR_SPANS * (t[-2] - t[0]))
     return spike
