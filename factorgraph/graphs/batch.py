@@ -82,7 +82,9 @@ class Batch:
                 # apart from each other: ranges between coincident points have no direction
                 v.r[:] = fallback + rng.normal(0.0, 0.5, 3)
         if not all(v.mode == "fixed" for v in rough):
-            graph = build(problem, rough, rx, use_phase=False).graph
+            # velocities that are to align the IMUs need absolute measurements, wanted in the solution or not
+            absolute = replace(problem, settings=replace(problem.settings, use_absolute=True))
+            graph = build(absolute, rough, rx, use_phase=False).graph
             graph.assemble()
             result = optimise(graph, START_ROBUST, 30, 1e-4, lambda i, c: None)
             if result.status is Status.SINGULAR:

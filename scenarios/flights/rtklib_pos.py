@@ -97,7 +97,7 @@ def _row(line: str) -> tuple[GpsTime, list[float]] | None:
     cells = line.replace(",", " ").split()
     try:
         values = [float(cell) for cell in cells[2 : 2 + N_VALUES]]
-        if len(values) < 5 or not np.all(np.isfinite(values[:3])):
+        if len(values) < 5 or not np.all(np.abs(values[:5]) < 1e9):  # NaN included
             return None
         return _instant(cells[0], cells[1]), values + [np.nan] * (N_VALUES - len(values))
     except (ValueError, IndexError):

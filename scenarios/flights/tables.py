@@ -223,7 +223,9 @@ def _number(cell: str | None) -> float | None:
 
 
 def _as_numpy(column: pa.ChunkedArray) -> Array:
-    return np.array(pc.fill_null(column, np.nan).to_numpy(), float)
+    values = np.array(pc.fill_null(column, np.nan).to_numpy(), float)
+    values[np.isinf(values)] = np.nan
+    return values
 
 
 def _as_text(column: pa.ChunkedArray) -> Names:

@@ -73,7 +73,8 @@ def _against_rtklib() -> None:
     if program is None or not (data / "cssrlib_kin_2021_265").exists():
         print("recorded rover against rnx2rtkp: skipped, recording or program missing")
         return
-    ours, _ = _timed("recorded rover, 360 epochs, read and solved", lambda: registry.solve(load("cssrlib_kin_2021_265", data).problem))
+    name = "cssrlib_kin_2021_265"
+    ours, _ = _timed("recorded rover, 360 epochs, read and solved", lambda: registry.solve(load(name, data).problem))
     kin = data / "cssrlib_kin_2021_265"
     files = [kin / "SEPT265G.21O", kin / "3034265G.21O", kin / "SEPT2650.21P"]
     command = [program, "-k", str(data / "reference/cssrlib_kin_kinematic_instantaneous.conf"), *map(str, files)]
