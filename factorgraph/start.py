@@ -19,7 +19,7 @@ from factorgraph.attitude import euler_from_matrix, matrix_from_euler
 from factorgraph.geodesy import LocalFrame
 from factorgraph.measurements import ImuStream
 from factorgraph.models import preintegration
-from factorgraph.types import Array, BoolArray
+from factorgraph.types import Array, BoolArray, IntArray
 
 WINDOW_S = 10.0
 MOVING_MPS = 2.0
@@ -92,18 +92,23 @@ def align(
         told[k] = bool(np.any(moving)) or float(np.linalg.norm(horizontal)) > 3.0
         U, _, Vt = np.linalg.svd(B)
         R[k] = U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt @ turn[k]
-    if heading_rad is not None:
-        R = _apply_heading(R, turn, told, heading_rad)
-    return R, bias[0, :3]
+    return _with_headings(R, turn, told, stretch, heading_rad), bias[0, :3]
 
 
-def _apply_heading(R: Array, turn: Array, told: BoolArray, heading_rad: float) -> Array:
-    """States whose heading nothing tells take it from the declared heading of state 0, carried by the gyroscope."""
+def _with_headings(R: Array, turn: Array, told: BoolArray, stretch: IntArray, heading_rad: float | None) -> Array:
+    """States whose heading nothing tells take one that the gyroscope carried to them.
+
+    From the declared heading of state 0; without one, from the nearest state of their stretch whose motion tells it, or from
+    the stretch's first state, so that at least they agree with each other.
+    """
     pitch, roll, _ = euler_from_matrix(R)
-    start = matrix_from_euler(float(pitch[0]), float(roll[0]), heading_rad)
-    carried = np.einsum("ij,kjl->kil", start, turn)
-    _, _, carried_heading = euler_from_matrix(carried)
-    out = R.copy()
-    for k in np.flatnonzero(~told):
-        out[k] = matrix_from_euler(float(pitch[k]), float(roll[k]), float(carried_heading[k]))
-    return out
+    source = np.zeros(len(R), np.int64)
+    if heading_rad is not None:
+        R = np.concatenate([matrix_from_euler(float(pitch[0]), float(roll[0]), heading_rad)[None], R[1:]])
+    else:
+        for k in np.flatnonzero(~told):
+            known = np.flatnonzero(told & (stretch == stretch[k]))
+            source[k] = known[np.argmin(np.abs(known - k))] if len(known) else np.argmax(stretch == stretch[k])
+    carried = R[source] @ np.swapaxes(turn[source], 1, 2) @ turn
+    _, _, heading = euler_from_matrix(carried)
+    return np.where(told[:, None, None], R, matrix_from_euler(pitch, roll, heading))

@@ -381,6 +381,22 @@ class ScalarColumns:
 
 
 @njit(cache=True)
+def _point_jacobians(at, by_r, is_rate, by_v, J_r, J_v):  # type: ignore[no-untyped-def]
+    """Rows by_r J_r + by_v J_v of the points `at`, the second term for rates only."""
+    n, w = len(at), J_r.shape[2]
+    J = np.zeros((n, w))
+    for i in range(n):
+        p = at[i]
+        for k in range(3):
+            for c in range(w):
+                J[i, c] += by_r[i, k] * J_r[p, k, c]
+            if is_rate[i]:
+                for c in range(w):
+                    J[i, c] += by_v[i, k] * J_v[p, k, c]
+    return J
+
+
+@njit(cache=True)
 def _project_entries(row, column, scale, u, clock, clock_start, factor, start, first, dense):  # type: ignore[no-untyped-def]
     """dense = P diag(u) C for the sparse columns C, P of models.differencing."""
     dense[:] = 0.0
@@ -495,13 +511,10 @@ class GnssBlock(Block):
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(j - i), self.keys(f), error)
 
     def predict(self) -> None:
-        at = self.point_rover
-        p = self.rover.vehicle.points(self.rover.query)
-        y, J = self._one_way(p.r_n[at], p.v_n[at], p.J_r[at], p.J_v[at], self.sat_rover, self.vel_rover)
+        y, J = self._one_way(self.rover, self.sat_rover, self.vel_rover)
         parts = [J]
         if self.reference is not None:
-            q = self.reference.vehicle.points(self.reference.query)
-            y_ref, J_ref = self._one_way(q.r_n[at], q.v_n[at], q.J_r[at], q.J_v[at], self.sat_reference, self.vel_reference)
+            y_ref, J_ref = self._one_way(self.reference, self.sat_reference, self.vel_reference)
             y = y - y_ref
             parts.append(-J_ref)
         phase = self.arc >= 0
@@ -511,17 +524,18 @@ class GnssBlock(Block):
         self.y = self.z - y
         self.J = np.hstack(parts)
 
-    def _one_way(self, r: Array, v: Array, J_r: Array, J_v: Array, sat: Array, vel: Array) -> tuple[Array, Array]:
-        d = sat - r
+    def _one_way(self, end: Endpoint, sat: Array, vel: Array) -> tuple[Array, Array]:
+        """Range or range rate (n,) of every row to one end, and its Jacobian (n, w) to that end's columns."""
+        at, is_rate = self.point_rover, self.rows.kind == DOPPLER
+        p = end.vehicle.points(end.query, velocity=bool(np.any(is_rate)))
+        d = sat - p.r_n[at]
         rho = np.linalg.norm(d, axis=1)
         e = d / rho[:, None]
-        rel = vel - v
+        rel = vel - p.v_n[at]
         rate = np.einsum("ni,ni->n", e, rel)
-        is_rate = self.rows.kind == DOPPLER
         # d rate / d r = -(rel - e (e . rel)) / rho
-        grad = np.where(is_rate[:, None], -(rel - e * rate[:, None]) / rho[:, None], -e)
-        J = np.einsum("ni,niw->nw", grad, J_r)
-        J[is_rate] -= np.einsum("ni,niw->nw", e[is_rate], J_v[is_rate])
+        by_position = np.where(is_rate[:, None], -(rel - e * rate[:, None]) / rho[:, None], -e)
+        J = _point_jacobians(at, by_position, is_rate, -e, p.J_r, p.J_v)
         return np.where(is_rate, rate, rho), J
 
     def columns(self, f: int) -> list[Array]:

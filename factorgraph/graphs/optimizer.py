@@ -177,6 +177,7 @@ def optimise(
     for iteration in range(max_iterations):
         for block in graph.blocks:
             block.reweight(robust)
+        net = None  # the old elimination and the new system need not be in memory together
         linear = graph.linearize()
         if order is None:
             order = graph.ordering(linear)
@@ -195,7 +196,7 @@ def optimise(
             lam = LAMBDA_START if lam == 0 else lam * 10
             if lam > LAMBDA_MAX:
                 status = Status.SINGULAR if net is None else Status.STALLED
-                return Result(status, costs, net)
+                return Result(status, costs, None if singular else eliminate(linear, order))
         lam = 0.0 if lam <= LAMBDA_START else lam / 10
         decrease, cost = cost - new, new
         costs.append(cost)

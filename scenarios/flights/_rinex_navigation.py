@@ -40,6 +40,7 @@ def read_messages(text: RinexText, into: Messages) -> None:
     if text.kind not in "NGH" or (text.kind == "G" and text.version >= 3):
         what = {"O": "an observation file", "M": "a meteorological file"}.get(text.kind, f"RINEX type {text.kind!r}")
         raise text.error(0, f"this is {what}, expected a navigation file")
+    into.notes.extend(text.remarks)
     _header_ionosphere(text, into)
     for begin, end, message in _records(text):
         if message.startswith("ION"):

@@ -6,6 +6,7 @@ A header line is 60 columns of content and 20 of label. Errors name the file and
 from __future__ import annotations
 
 import gzip
+import warnings
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,7 @@ class RinexText:
     kind: str  # "O" observation, "N" navigation, "G" GLONASS navigation of RINEX 2, ...
     system: str  # the header's satellite system letter
     header: tuple[tuple[str, str], ...]  # (label, content padded to 60 columns)
+    remarks: tuple[str, ...] = ()  # of the decompression
 
     @property
     def first_line(self) -> int:
@@ -54,7 +56,7 @@ def read_rinex(path: Path) -> RinexText:
 
     Raises InputError for files that are absent, empty, not RINEX, of an unknown version or cut inside the header.
     """
-    data = _unpacked(path)
+    data, remarks = _unpacked(path)
     if not data.strip():
         raise InputError(f"{path}: the file is empty")
     starts, ends = line_bounds(data)
@@ -68,7 +70,7 @@ def read_rinex(path: Path) -> RinexText:
         raise InputError(f"{path}, line 1: RINEX version {first[:9].strip()!r} is not a number") from None
     if not 2.0 <= version < 5.0:
         raise InputError(f"{path}, line 1: RINEX version {version:.2f} is not supported (2, 3 and 4 are)")
-    return RinexText(path, data, starts, ends, version, first[20].upper(), first[40].upper(), header)
+    return RinexText(path, data, starts, ends, version, first[20].upper(), first[40].upper(), header, remarks)
 
 
 def line_bounds(data: bytes) -> tuple[IntArray, IntArray]:
@@ -83,7 +85,7 @@ def line_bounds(data: bytes) -> tuple[IntArray, IntArray]:
     return starts.astype(np.int64), ends.astype(np.int64)
 
 
-def _unpacked(path: Path) -> bytes:
+def _unpacked(path: Path) -> tuple[bytes, tuple[str, ...]]:
     try:
         data = path.read_bytes()
     except OSError as e:
@@ -94,16 +96,24 @@ def _unpacked(path: Path) -> bytes:
         except (OSError, EOFError, zlib.error) as e:
             raise InputError(f"{path}: broken gzip file ({e})") from None
     if data.startswith(PACKED) or b"CRINEX VERS" in data[:100]:
-        data = _hatanaka(path, data)
-    return data
+        return _hatanaka(path, data)
+    return data, ()
 
 
-def _hatanaka(path: Path, data: bytes) -> bytes:
-    import hatanaka  # only where a file asks for it
+def _hatanaka(path: Path, data: bytes) -> tuple[bytes, tuple[str, ...]]:
+    """Unpacked content, and what was lost of a damaged file."""
+    import zipfile  # both only where a file asks for it
 
+    import hatanaka
+
+    # RuntimeError and NotImplementedError: zip files with a password or an unknown method
+    broken = (ValueError, OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError, hatanaka.hatanaka.HatanakaException)
     try:
-        return bytes(hatanaka.decompress(data))
-    except (ValueError, OSError, EOFError, zlib.error, hatanaka.hatanaka.HatanakaException) as e:
+        with warnings.catch_warnings(record=True) as lost:
+            warnings.simplefilter("always")
+            data = bytes(hatanaka.decompress(data))
+        return data, tuple(" ".join(str(w.message).split()) for w in lost)
+    except broken as e:
         reason = str(e).strip().splitlines()
         raise InputError(f"{path}: cannot be decompressed ({reason[0] if reason else type(e).__name__})") from None
 

@@ -100,7 +100,7 @@ def read_observations(path: Path) -> RawObservations:
     """
     text = read_rinex(Path(path))
     header = read_header(text)
-    tally = _Tally(Counter(), [])
+    tally = _Tally(Counter(), list(text.remarks))
     raw = np.frombuffer(text.data, np.uint8)
     layout = _layout_2(text, raw, header, tally) if text.version < 3 else _layout_3(text, raw, header, tally)
     parts = [_decode(text, raw, header, layout, system, tally) for system in header.types]

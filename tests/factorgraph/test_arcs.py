@@ -22,7 +22,9 @@ FAR_N = np.tile([300.0, -200.0, 40.0], (EPOCHS, 1))
 Rows = list[tuple[int, str, str]]
 
 
-def receivers(signals: tuple[str, ...], without: Callable[[int, str, str], bool] = lambda e, s, k: False) -> tuple[GnssStream, GnssStream]:
+def receivers(
+    signals: tuple[str, ...], without: Callable[[int, str, str], bool] = lambda e, s, k: False
+) -> tuple[GnssStream, GnssStream]:
     """Two receivers at rest, the rover without some rows."""
     rows = every(EPOCHS, SATELLITES, signals)
     return receiver(T, rows), receiver(T, [row for row in rows if not without(*row)], r_n=FAR_N, clock_m=120.0)

@@ -191,7 +191,7 @@ def _without_imu(problem: NavigationProblem, names: str) -> NavigationProblem:
 
 # -- with noise ------------------------------------------------------------------------------------
 
-SEEDS = range(10, 20)
+SEEDS = range(10, 18)
 
 
 def test_noisy_flights_are_fixed_right_and_consistent() -> None:

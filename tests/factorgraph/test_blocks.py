@@ -39,7 +39,15 @@ GRID = np.arange(5.0)
 SATELLITES = ("G01", "G02", "G03", "G04", "G05", "G06", "E11", "E12", "E13")
 LEVER = {"a": (0.3, -1.2, 0.8), "b": (-0.2, 0.9, 0.4)}
 PLACE_N = {"a": np.array([20.0, -30.0, 12.0]), "b": np.array([48.0, -21.0, 25.0])}
-STEP = {"x": (3e-3, 0.01), "p": (0.01,), "v": (0.02,), "b": (1e-2, 1e-3), "a": (1.0,), "i": (1.0,), "s": (0.01,)}  # halves of the columns
+STEP = {
+    "x": (3e-3, 0.01),
+    "p": (0.01,),
+    "v": (0.02,),
+    "b": (1e-2, 1e-3),
+    "a": (1.0,),
+    "i": (1.0,),
+    "s": (0.01,),
+}  # halves of the columns
 GNSS_STEP = STEP | {"x": (3e-3, 10.0), "p": (10.0,), "v": (1.0,)}
 # left out of Jacobians on purpose: the Earth's rate times the time since the state, second order in bias changes
 CARRIED = 1e-3
@@ -133,7 +141,9 @@ def assert_jacobians(graph: Graph, block: Block, steps: dict[str, tuple[float, .
                 numeric[:, column] = (rows[0] - rows[1]) / (2 * size[column])
             # rounding of 2e7 m in a row of a few millimetres' sigma is the floor
             bound = tolerance * np.abs(J * size).max() + 1e-6
-            assert np.abs((numeric - J) * size).max() < bound, f"factor {f}, {letter}: {np.abs((numeric - J) * size).max():.2g} against {bound:.2g}"
+            assert np.abs((numeric - J) * size).max() < bound, (
+                f"factor {f}, {letter}: {np.abs((numeric - J) * size).max():.2g} against {bound:.2g}"
+            )
     graph.take(base)
     block.whiten()
     assert tried
@@ -194,9 +204,18 @@ def test_positions_and_heights(mode: str, offset_s: float) -> None:
 
 
 def ranges_between(t: Array, anchors: bool) -> RangeModel:
-    tags = (Tag("a1", "a", LEVER["a"]), Tag("b1", "b", LEVER["b"]), Tag("b2", "b", (0.0, 1.0, 0.0)), Tag("x", position_n=(5.0, 60.0, -3.0)))
-    first, second = (np.full(len(t), 3), 1 + np.arange(len(t)) % 2) if anchors else (np.zeros(len(t), int), 1 + np.arange(len(t)) % 2)
-    return RangeModel(RangeStream(t, first, second, tags, np.full(len(t), 30.0), np.full(len(t), 0.1)), bias_sigma_m=0.3, scale_sigma=0.01)
+    tags = (
+        Tag("a1", "a", LEVER["a"]),
+        Tag("b1", "b", LEVER["b"]),
+        Tag("b2", "b", (0.0, 1.0, 0.0)),
+        Tag("x", position_n=(5.0, 60.0, -3.0)),
+    )
+    first, second = (
+        (np.full(len(t), 3), 1 + np.arange(len(t)) % 2) if anchors else (np.zeros(len(t), int), 1 + np.arange(len(t)) % 2)
+    )
+    return RangeModel(
+        RangeStream(t, first, second, tags, np.full(len(t), 30.0), np.full(len(t), 0.1)), bias_sigma_m=0.3, scale_sigma=0.01
+    )
 
 
 @pytest.mark.parametrize("modes", [("imu", "imu"), ("motion", "imu"), ("fixed", "motion")])
@@ -228,7 +247,9 @@ def test_factors_hand_out_the_blocks_rows() -> None:
     blocks: list[Block] = [link_of(problem, ends).block, ranges, *position_blocks(ends["b"])]
     graph = evaluated(ends, blocks)
     linear = graph.graph.linearize(graph.values)
-    assert abs(graph.graph.error(graph.values) - 0.5 * sum(float(b.e @ b.e) for b in blocks)) < 1e-9 * graph.graph.error(graph.values)
+    assert abs(graph.graph.error(graph.values) - 0.5 * sum(float(b.e @ b.e) for b in blocks)) < 1e-9 * graph.graph.error(
+        graph.values
+    )
     index = 0
     for block in blocks:
         for f in range(len(block.rows.factor.start)):
@@ -373,7 +394,9 @@ def test_ionosphere_walks_between_steps() -> None:
         mine = (block.rows.label_index == satellite) & (block.rows.factor.of_row == 0)
         code, phase = (block.iono_scale[mine & (block.rows.kind == kind)] for kind in (0, 1))
         np.testing.assert_allclose(code, -phase)
-        np.testing.assert_allclose(np.sort(code / code.min()), np.sort(np.unique((block.wavelength_m[mine] / 0.1902936728) ** 2)), rtol=1e-6)
+        np.testing.assert_allclose(
+            np.sort(code / code.min()), np.sort(np.unique((block.wavelength_m[mine] / 0.1902936728) ** 2)), rtol=1e-6
+        )
         assert code.min() >= 1.0
 
 

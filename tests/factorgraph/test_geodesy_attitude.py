@@ -198,7 +198,13 @@ def test_functions_of_many_are_those_of_each() -> None:
     rng = np.random.default_rng(4)
     phi = rng.normal(0.0, 2.0, (50, 3))
     many = exp_so3(phi)
-    for function, x in ((exp_so3, phi), (skew, phi), (quat_from_matrix, many), (log_so3, many), (matrix_from_quat, quat_from_matrix(many))):
+    for function, x in (
+        (exp_so3, phi),
+        (skew, phi),
+        (quat_from_matrix, many),
+        (log_so3, many),
+        (matrix_from_quat, quat_from_matrix(many)),
+    ):
         np.testing.assert_array_equal(function(x), np.array([function(one) for one in x]))
 
 
@@ -226,7 +232,9 @@ def test_calendar_of_a_known_instant() -> None:
     assert GpsTime.from_calendar(2024, 2, 29, 23, 59, 60.0) == GpsTime.from_calendar(2024, 3, 1)
 
 
-@pytest.mark.parametrize(("year", "month", "seconds"), [(2003, 5, 13), (2008, 12, 14), (2012, 6, 15), (2012, 7, 16), (2016, 12, 17), (2024, 6, 18)])
+@pytest.mark.parametrize(
+    ("year", "month", "seconds"), [(2003, 5, 13), (2008, 12, 14), (2012, 6, 15), (2012, 7, 16), (2016, 12, 17), (2024, 6, 18)]
+)
 def test_leap_seconds(year: int, month: int, seconds: int) -> None:
     utc = datetime(year, month, 20, 12, tzinfo=UTC)
     assert leap_seconds(utc) == seconds

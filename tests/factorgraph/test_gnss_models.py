@@ -200,7 +200,9 @@ def test_a_common_tracking_mode_comes_first() -> None:
     """G5Q with G5Q though each receiver would prefer another of its own; without a common one the best of each."""
     t = np.zeros(1)
     a = receiver(t, [(0, "G01", "G5X"), (0, "G01", "G5Q"), (0, "G02", "G5X"), (0, "G03", "G1C"), (0, "G03", "G1W")])
-    b = receiver(t, [(0, "G01", "G5Q"), (0, "G01", "G5I"), (0, "G02", "G5I"), (0, "G02", "G5Q"), (0, "G03", "G1W"), (0, "G03", "G1C")])
+    b = receiver(
+        t, [(0, "G01", "G5Q"), (0, "G01", "G5I"), (0, "G02", "G5I"), (0, "G02", "G5Q"), (0, "G03", "G1W"), (0, "G03", "G1C")]
+    )
     pairs = paired(a, b)
     # between two signals common to both, C is preferred to W
     assert described(a, b, pairs) == [(0, "G03", "G1C", "G1C"), (0, "G01", "G5Q", "G5Q"), (0, "G02", "G5X", "G5Q")]

@@ -175,7 +175,11 @@ def test_one_range_per_state_is_singular() -> None:
     model = measured(6)
     stream = model.stream
     keep = stream.tag_b == 1
-    one = RangeModel(RangeStream(stream.t_s[keep], stream.tag_a[keep], stream.tag_b[keep], stream.tags, stream.range_m[keep], stream.sigma_m[keep]))
+    one = RangeModel(
+        RangeStream(
+            stream.t_s[keep], stream.tag_a[keep], stream.tag_b[keep], stream.tags, stream.range_m[keep], stream.sigma_m[keep]
+        )
+    )
     v = VehicleVariables(0, Vehicle("a"), T, FRAME)
     v.r[:] = [20.0, 20.0, 3.0]
     ranges = range_blocks(one, {"a": v}, 0)

@@ -104,7 +104,9 @@ def test_intervals_of_one_call_are_those_of_single_calls() -> None:
     for i in range(len(start)):
         one = over(imu, start[i], stop[i], bias[i])
         for name in Increments.__dataclass_fields__:
-            np.testing.assert_allclose(getattr(many, name)[i], getattr(one, name)[0], rtol=0, atol=1e-5 if "_db" in name else 1e-8, err_msg=name)
+            np.testing.assert_allclose(
+                getattr(many, name)[i], getattr(one, name)[0], rtol=0, atol=1e-5 if "_db" in name else 1e-8, err_msg=name
+            )
 
 
 def test_an_empty_interval_is_no_motion() -> None:
@@ -148,7 +150,9 @@ def test_the_last_sample_holds_beyond_the_recording() -> None:
 
 
 def test_uneven_samples_and_gaps_weigh_by_time() -> None:
-    imu = ImuStream(np.array([0.0, 0.01, 0.5, 0.51]), np.array([[1.0, 0, 0], [1, 0, 0], [3, 0, 0], [5, 0, 0]]), np.zeros((4, 3)), True)
+    imu = ImuStream(
+        np.array([0.0, 0.01, 0.5, 0.51]), np.array([[1.0, 0, 0], [1, 0, 0], [3, 0, 0], [5, 0, 0]]), np.zeros((4, 3)), True
+    )
     np.testing.assert_allclose(over(imu, 0.0, 0.51, np.zeros(6)).dv[0, 0], 0.01 + 3 * 0.49 + 0.05, atol=1e-12)
 
 

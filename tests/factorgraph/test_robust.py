@@ -45,7 +45,13 @@ def test_even_bounded_and_never_rising(kernel: Kernel) -> None:
 
 @pytest.mark.parametrize(
     ("kernel", "w", "rho"),
-    [("huber", 0.5, 2 * 4 - 2), ("cauchy", 0.2, 2 * np.log(5)), ("geman-mcclure", 0.04, 8 / 5), ("tukey", 0.0, 4 / 6), ("none", 1.0, 8.0)],
+    [
+        ("huber", 0.5, 2 * 4 - 2),
+        ("cauchy", 0.2, 2 * np.log(5)),
+        ("geman-mcclure", 0.04, 8 / 5),
+        ("tukey", 0.0, 4 / 6),
+        ("none", 1.0, 8.0),
+    ],
 )
 def test_values_at_twice_the_width(kernel: Kernel, w: float, rho: float) -> None:
     """By hand from the definitions with c = 2, t = 4."""
