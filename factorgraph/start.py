@@ -102,13 +102,13 @@ def _with_headings(R: Array, turn: Array, told: BoolArray, stretch: IntArray, he
     the stretch's first state, so that at least they agree with each other.
     """
     pitch, roll, _ = euler_from_matrix(R)
-    source = np.zeros(len(R), np.int64)
+    source, base = np.zeros(len(R), np.int64), R.copy()
     if heading_rad is not None:
-        R = np.concatenate([matrix_from_euler(float(pitch[0]), float(roll[0]), heading_rad)[None], R[1:]])
+        base[0] = matrix_from_euler(float(pitch[0]), float(roll[0]), heading_rad)
     else:
         for k in np.flatnonzero(~told):
             known = np.flatnonzero(told & (stretch == stretch[k]))
             source[k] = known[np.argmin(np.abs(known - k))] if len(known) else np.argmax(stretch == stretch[k])
-    carried = R[source] @ np.swapaxes(turn[source], 1, 2) @ turn
+    carried = base[source] @ np.swapaxes(turn[source], 1, 2) @ turn
     _, _, heading = euler_from_matrix(carried)
     return np.where(told[:, None, None], R, matrix_from_euler(pitch, roll, heading))

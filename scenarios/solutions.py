@@ -54,13 +54,14 @@ def load(folder: Path) -> Solution:
             raise InputError(f"{text}: not a solution of relnav")
         if tree.get("version") != VERSION:
             raise InputError(f"{text}: version {tree.get('version')} cannot be read (only {VERSION}); run `relnav smooth` again")
-        with np.load(packed, allow_pickle=False) as arrays:
+        # np.load leaves a file it cannot read open when it opens it itself
+        with packed.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             solution: Solution = _decoded(Solution, tree["solution"], arrays)
             return solution
     except OSError as error:
         name = error.filename or folder
         raise InputError(f"{name}: {error.strerror or error}; a folder that `relnav smooth` wrote is needed") from error
-    except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
+    except (zipfile.BadZipFile, EOFError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{folder}: the solution is damaged ({error}); run `relnav smooth` again") from error

@@ -128,8 +128,8 @@ def _unusable(values: Array, system: str) -> str:
     if system == "R":
         sensible = 2e4 < np.linalg.norm(values[orbits.G_POS]) < 3e4
     else:
-        flags = np.nan_to_num(values[[orbits.CODES, orbits.HEALTH]])
-        sensible = 2e3 < values[orbits.SQRT_A] < 1e4 and 0 <= values[orbits.ECC] < 0.3 and bool(np.all(abs(flags) < 2**31))
+        flags = np.abs(np.nan_to_num(values[[orbits.CODES, orbits.HEALTH]]))
+        sensible = 2e3 < values[orbits.SQRT_A] < 1e4 and 0 <= values[orbits.ECC] < 0.3 and flags.max() < 2**31
     return "" if sensible else "orbit impossible"
 
 

@@ -484,8 +484,15 @@ def _check_overlap(v: Vehicle, problem: NavigationProblem) -> None:
                     f"vehicle {v.name}: {name} ({_as_span(span)}) and {other} ({_as_span(other_span)}) do not overlap; "
                     "check epoch, unit and offset_s of their time columns"
                 )
-    if v.truth is not None and v.truth.t_s.size and spans and all(_apart(s, (v.truth.t_s[0], v.truth.t_s[-1])) for _, s in spans):
-        raise InputError(f"vehicle {v.name}: truth ({_as_span((v.truth.t_s[0], v.truth.t_s[-1]))}) does not overlap its sensors")
+    if v.truth is None or not v.truth.t_s.size or not spans:
+        return
+    known = (float(v.truth.t_s[0]), float(v.truth.t_s[-1]))
+    if all(_apart(span, known) for _, span in spans):
+        name, span = spans[0]
+        raise InputError(
+            f"vehicle {v.name}: truth ({_as_span(known)}) and {name} ({_as_span(span)}) do not overlap; "
+            "check epoch, unit and offset_s of their time columns"
+        )
 
 
 def _short_imu(v: Vehicle) -> str:

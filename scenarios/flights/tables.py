@@ -33,7 +33,7 @@ NULLS = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None", "
 FAR_S, FAR_SPANS = 600.0, 10.0  # a single time stamp further than both from the span of all others is wrong
 PROBE_LINES = 200  # lines looked at for the number of columns
 PROBE_BYTES = 1 << 16  # looked at for what is not text
-MAX_NOT_TEXT = 0.01  # share of bytes: a logger that loses power leaves a few
+MAX_NOT_TEXT = 0.05  # share of bytes: a logger that loses power leaves a few
 NOT_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 
 Names = np.ndarray[tuple[int], np.dtype[np.str_]]

@@ -256,8 +256,9 @@ def test_factors_hand_out_the_blocks_rows() -> None:
             factor = linear.at(index)
             i, j = block.slices(f)
             assert list(factor.keys()) == block.keys(f)
-            np.testing.assert_allclose(factor.getA(), np.hstack(block.columns(f)), atol=1e-12)
-            np.testing.assert_allclose(factor.getb(), -block.e[i:j], atol=1e-12)
+            A, b = factor.getA(), factor.getb()  # type: ignore[attr-defined]
+            np.testing.assert_allclose(A, np.hstack(block.columns(f)), atol=1e-12)
+            np.testing.assert_allclose(b, -block.e[i:j], atol=1e-12)
             index += 1
     assert index == linear.size()
 
@@ -358,7 +359,7 @@ def test_normalised_residual_of_an_outlier_is_its_own() -> None:
 
 
 def test_inactive_rows_count_nowhere() -> None:
-    problem, ends = problem_of(("fixed", "imu"))
+    _, ends = problem_of(("fixed", "imu"))
     position, _ = position_blocks(ends["b"])
     evaluated(ends, [position])
     position.w = np.ones(position.n)

@@ -173,10 +173,10 @@ DT_S, Q = 1.0, 0.5**2
 def constant_velocity(every_nth: int) -> gtsam.GaussianFactorGraph:
     """White-noise acceleration in three axes, positions with 1 m at every n-th state, a weak prior."""
     graph = gtsam.NonlinearFactorGraph()
-    whiten = np.linalg.inv(np.linalg.cholesky(Q * np.array([[DT_S**3 / 3, DT_S**2 / 2], [DT_S**2 / 2, DT_S]])))
-    eye = np.eye(3)
-    p0, v0 = (np.kron(whiten @ column, eye) for column in ([[-1.0], [0.0]], [[-DT_S], [-1.0]]))
-    p1, v1 = (np.kron(whiten @ column, eye) for column in ([[1.0], [0.0]], [[0.0], [1.0]]))
+    whiten: Array = np.linalg.inv(np.linalg.cholesky(Q * np.array([[DT_S**3 / 3, DT_S**2 / 2], [DT_S**2 / 2, DT_S]])))
+    eye: Array = np.eye(3)
+    p0, v0 = (np.kron(whiten @ np.array(column), eye).astype(float) for column in ([[-1.0], [0.0]], [[-DT_S], [-1.0]]))
+    p1, v1 = (np.kron(whiten @ np.array(column), eye).astype(float) for column in ([[1.0], [0.0]], [[0.0], [1.0]]))
     for k in range(STATES - 1):
         keys = [key("p", 0, k), key("v", 0, k), key("p", 0, k + 1), key("v", 0, k + 1)]
         graph.add(linear(keys, [p0, v0, p1, v1]))

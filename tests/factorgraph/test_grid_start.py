@@ -137,6 +137,22 @@ def test_a_vehicle_at_rest_levels_and_takes_the_declared_heading() -> None:
     assert np.abs(no_hint[:, :2]).max() < 0.005 and np.ptp(no_hint[:, 2]) < 0.02  # level, heading unknown but steady
 
 
+def test_heading_from_motion_goes_back_to_the_rest_before() -> None:
+    """Twenty seconds at rest, then straight ahead: the gyroscope knows that the vehicle stood as it left."""
+    grid, t = np.arange(41.0), np.arange(-1, 4101) / 100.0
+    heading = 2.0
+
+    def straight(at: Array) -> tuple[Array, Array, Array]:
+        since = np.maximum(at - 20.0, 0.0)[:, None]
+        ahead = np.array([np.sin(heading), np.cos(heading), 0.0])
+        return since**2 * ahead, 2 * since * ahead, np.tile(matrix_from_euler(0.02, -0.03, heading), (len(at), 1, 1))
+
+    f, w = (x[1:] for x in ideal_imu(FRAME, t, *straight(t)))
+    r, v, true = straight(grid)
+    found, _ = align(ImuStream(t[1:], f, w, True), grid, r, v, FRAME, None)
+    assert np.linalg.norm(log_so3(found @ np.swapaxes(true, 1, 2)), axis=1).max() < 0.05
+
+
 def test_motion_overrules_a_wrong_hint() -> None:
     error, _, _ = aligned(turning=True, hint=-1.0)
     assert np.linalg.norm(error, axis=1).max() < 0.02
@@ -148,15 +164,14 @@ def test_no_rest_no_bias() -> None:
     shaken = ImuStream(t, rng.normal(0, 2, (2000, 3)) + [0, 0, 9.8], rng.normal(0.1, 0.5, (2000, 3)), True)
     np.testing.assert_array_equal(rest_bias(shaken), 0.0)
     calm = np.where((t > 10)[:, None], 0.003, shaken.w_b)
-    force = np.where((t > 10)[:, None], [0, 0, 9.8], shaken.f_b)
+    force = np.where((t > 10)[:, None], np.array([0.0, 0.0, 9.8]), shaken.f_b)
     np.testing.assert_allclose(rest_bias(ImuStream(t, force, calm, True)), 0.003, atol=1e-12)  # later rest counts too
 
 
 def test_interpolation_passes_over_missing_rows() -> None:
     x = np.array([[0.0, 1.0], [np.nan, 5.0], [2.0, 3.0]])
-    np.testing.assert_allclose(
-        interpolate(np.array([-1.0, 0.5, 1.0, 9.0]), np.arange(3.0), x), [[0, 1], [0.5, 1.5], [1, 2], [2, 3]]
-    )
+    found = interpolate(np.array([-1.0, 0.5, 1.0, 9.0]), np.arange(3.0), x)
+    np.testing.assert_allclose(found, np.array([[0.0, 1.0], [0.5, 1.5], [1.0, 2.0], [2.0, 3.0]]))
 
 
 # -- methods ---------------------------------------------------------------------------------------
