@@ -155,7 +155,8 @@ class Settings:
     systems: str = "GREJC"  # constellations used, RINEX letters (GLONASS: code and Doppler only)
     bands: str = "125678"  # RINEX band digits used
     use_absolute: bool = True  # undifferenced code and Doppler in the graph
-    ionosphere_model: Literal["broadcast", "none"] = "broadcast"  # Klobuchar, applied to every observation
+    # Klobuchar: "broadcast" corrects every observation, "absolute" only undifferenced code, "none" nothing
+    ionosphere_model: Literal["broadcast", "absolute", "none"] = "broadcast"
     ionosphere_ppm: float = 1.0  # differential vertical ionosphere per baseline length, standard deviation; 0: none
     ionosphere_min_baseline_m: float = 10_000.0  # shorter links: antenna phase centres, which are not modelled, matter more
     ionosphere_step_s: float = 60.0  # piecewise constant per satellite, a random walk between steps

@@ -194,7 +194,12 @@ def describe_os_error(error: OSError) -> str:
 def entry() -> NoReturn:
     """The console script; an unexpected error ends with BUG, which no result code uses."""
     sys.excepthook = _report_bug
-    sys.exit(main())
+    code = main()
+    if guard.TRACE_OPTION in sys.argv:
+        # while the interpreter takes itself down, another interrupt would end it by signal, and native code may crash
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def _run(argv: list[str]) -> int:
@@ -272,6 +277,9 @@ def _fail(message: str) -> int:
 
 
 def _report_bug(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    if guard.is_stopping():
+        print("relnav: stopped", file=sys.stderr, flush=True)
+        os._exit(guard.INTERRUPTED)
     traceback.print_exception(kind, error, trace)
     print("relnav: this is an error in relnav itself; please report it with the lines above", file=sys.stderr, flush=True)
     sys.stdout.flush()

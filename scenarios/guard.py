@@ -15,6 +15,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
@@ -26,6 +27,7 @@ CRASH_FILE = "crash.txt"
 RESEND_S = 0.5  # the child may not have installed its handler yet; it acts on the first signal only
 
 _ROOT = Path(__file__).resolve().parent.parent
+_stopping = threading.Event()
 
 
 class Stopped(Exception):
@@ -54,9 +56,15 @@ class Trace:
 
 def _interrupt_once(signum: int, frame: FrameType | None) -> NoReturn:
     # one interrupt: what follows is saving and cleaning up, which must not be interrupted again
+    _stopping.set()
     for number in (signal.SIGINT, *_requests_to_end()):
         signal.signal(number, signal.SIG_IGN)
     raise KeyboardInterrupt
+
+
+def is_stopping() -> bool:
+    """Whether an interrupt has arrived; native libraries may turn it into an error of theirs."""
+    return _stopping.is_set()
 
 
 def _requests_to_end() -> list[signal.Signals]:

@@ -14,12 +14,13 @@ import numpy as np
 
 from factorgraph import start
 from factorgraph.graphs import integers
-from factorgraph.graphs.build import Built, Receiver, build, native_factors, receivers
+from factorgraph.graphs.blocks import KINDS
+from factorgraph.graphs.build import Built, Receiver, build, correct_again, native_factors, receivers
 from factorgraph.graphs.optimizer import Graph, Result, optimise
 from factorgraph.graphs.result import make_solution
 from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.grid import common_grid
-from factorgraph.problem import MotionPrior, NavigationProblem, Robust
+from factorgraph.problem import MotionPrior, NavigationProblem, Robust, Settings
 from factorgraph.registry import Progress
 from factorgraph.solution import Solution, Status
 from factorgraph.types import Array
@@ -27,8 +28,10 @@ from factorgraph.types import Array
 START_MOTION = MotionPrior((3.0, 3.0, 3.0))  # for the first graph, vehicles with an IMU
 START_ROBUST = {kind: Robust("huber", 2.0) for kind in ("code", "doppler", "range", "position", "height")}
 FIX_ROUNDS = 8
+CORRECTED_M = 1e-4  # change of a correction that is worth another solution
 ROUGH = 1e-3  # tolerance between rounds; only the last solution needs the settings' own
-REBIAS = np.array([1e-3, 1e-3, 1e-3, 0.02, 0.02, 0.02])  # bias change that asks for preintegrating again
+FIRST = 3e-2  # tolerance before the first biases are known
+REBIAS = np.array([3e-3, 3e-3, 3e-3, 0.1, 0.1, 0.1])  # bias change that asks for preintegrating again
 
 
 class Batch:
@@ -84,6 +87,8 @@ class Batch:
         if not all(v.mode == "fixed" for v in rough):
             # velocities that are to align the IMUs need absolute measurements, wanted in the solution or not
             absolute = replace(problem, settings=replace(problem.settings, use_absolute=True))
+            if all(known):  # ranges only help to find positions
+                absolute = replace(absolute, ranges=())
             graph = build(absolute, rough, rx, use_phase=False).graph
             graph.assemble()
             result = optimise(graph, START_ROBUST, 30, 1e-4, lambda i, c: None)
@@ -121,7 +126,13 @@ class Batch:
         """Float solution, integers, releases; the result carries the whole cost history."""
         settings, graph = problem.settings, built.graph
         clock.stage("float solution", 0.3)
+        placed = all(v.is_fixed or v.gnss is not None or v.positions for v in problem.vehicles)
+        convex = None if placed else _convex(settings, graph)  # starts found from ranges alone may be far off
+        if convex is not None:
+            self._settle(replace(problem, settings=convex), graph, clock)
         result = self._settle(problem, graph, clock)
+        if max((correct_again(problem, data, built.receivers, built.ends) for data in built.links), default=0.0) > CORRECTED_M:
+            result = self._continue(problem, graph, result, clock)
         for _ in range(4):
             if not sum(integers.split_slipped(data, settings.ambiguity) for data in built.links if len(data.block.amb_key)):
                 break
@@ -148,16 +159,19 @@ class Batch:
         """Optimise, preintegrating again while the biases move away from those preintegrated at."""
         graph.assemble()
         costs: list[float] = []
-        for _ in range(5):
-            result = optimise(graph, problem.settings.robust, problem.settings.max_iterations, ROUGH, clock.iteration)
+        for turn in range(5):
+            tolerance = ROUGH if turn else FIRST
+            result = optimise(graph, problem.settings.robust, problem.settings.max_iterations, tolerance, clock.iteration)
             costs += result.costs
             moved = [
                 v
                 for v in graph.vehicles
                 if v.mode == "imu" and np.any(np.abs(v.bias - v.preintegrated_bias).max(axis=0) > REBIAS)
             ]
-            if not moved or result.status is not Status.CONVERGED:
+            if turn and (not moved or result.status is not Status.CONVERGED):
                 break
+            if not moved:
+                continue
             native_factors(graph)
             for block in graph.blocks:
                 block.refresh()
@@ -170,6 +184,16 @@ class Batch:
         graph.assemble()
         result = optimise(graph, problem.settings.robust, problem.settings.max_iterations, tolerance, clock.iteration)
         return Result(result.status, before.costs + result.costs, result.bayes_net)
+
+
+def _convex(settings: Settings, graph: Graph) -> Settings | None:
+    """Settings with Huber's loss for those that have local minima, None where no measurement uses such a loss."""
+    kinds = {KINDS[i] for block in graph.blocks for i in np.unique(block.rows.kind).tolist() if i >= 0}
+    redescending = {kind for kind, r in settings.robust.items() if kind in kinds and r.kernel not in ("none", "huber")}
+    if not redescending:
+        return None
+    huber = {kind: Robust("huber", settings.robust[kind].width) for kind in redescending}
+    return replace(settings, robust={**settings.robust, **huber})
 
 
 class _Clock:

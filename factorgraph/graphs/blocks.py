@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 from numba import njit
 
-from factorgraph.graphs.variables import Query, VehicleVariables
+from factorgraph.graphs.variables import Point, Query, VehicleVariables
 from factorgraph.models.differencing import CommonGroups
 from factorgraph.models.robust import cost as robust_cost
 from factorgraph.models.robust import weight as robust_weight
@@ -428,6 +428,10 @@ class GnssBlock(Block):
 
     Predicted (common clocks projected out): |s - a_rover| - |s' - a_ref| for code and phase (+ lambda N), and
     e . (v_s - v_a) likewise for Doppler. `reference` is None for undifferenced rows.
+
+    Of a moving reference, differences are to tell where the rover is relative to it, not where it is: 20 m change them by
+    5 mm at 5 km, less than antennas and atmosphere leave for minutes on end. They are therefore predicted for a reference
+    at `place_n`, known beforehand, and a rover at `place_n` + a_rover - a_ref.
     """
 
     rover: Endpoint
@@ -442,6 +446,7 @@ class GnssBlock(Block):
     arc: IntArray  # (n,) ambiguity arc of a phase row, -1 elsewhere
     amb_key: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (arcs,) 0: constant
     amb_value: Array = field(default_factory=lambda: np.zeros(0))  # (arcs,) cycles
+    place_n: Array | None = None  # (m, 3) one per factor: where a moving reference is taken to be
     iono: IntArray = field(init=False)  # (n,) row -> ionosphere variable, -1 none
     iono_scale: Array = field(init=False)  # (n,) metres of this row per metre of it
     iono_key: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -511,32 +516,39 @@ class GnssBlock(Block):
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(j - i), self.keys(f), error)
 
     def predict(self) -> None:
-        y, J = self._one_way(self.rover, self.sat_rover, self.vel_rover)
-        parts = [J]
-        if self.reference is not None:
-            y_ref, J_ref = self._one_way(self.reference, self.sat_reference, self.vel_reference)
-            y = y - y_ref
-            parts.append(-J_ref)
+        has_rate = bool(np.any(self.rows.kind == DOPPLER))
+        rover = self.rover.vehicle.points(self.rover.query, velocity=has_rate)
+        if self.reference is None:
+            y, by_r, e = self._one_way(rover.r_n, rover.v_n, self.sat_rover, self.vel_rover)
+            self.J = self._jacobian(by_r, e, rover)
+        else:
+            reference = self.reference.vehicle.points(self.reference.query, velocity=has_rate)
+            at = reference.r_n if self.place_n is None else self.place_n
+            y, by_r, e = self._one_way(at + (rover.r_n - reference.r_n), rover.v_n, self.sat_rover, self.vel_rover)
+            y_ref, by_r_ref, e_ref = self._one_way(at, reference.v_n, self.sat_reference, self.vel_reference)
+            y -= y_ref
+            by_r_ref = by_r_ref if self.place_n is None else by_r
+            self.J = np.hstack([self._jacobian(by_r, e, rover), -self._jacobian(by_r_ref, e_ref, reference)])
         phase = self.arc >= 0
         y[phase] += self.wavelength_m[phase] * self.amb_value[self.arc[phase]]
         if len(self.iono_value):
             y += np.where(self.iono >= 0, self.iono_scale * self.iono_value[self.iono], 0.0)
         self.y = self.z - y
-        self.J = np.hstack(parts)
 
-    def _one_way(self, end: Endpoint, sat: Array, vel: Array) -> tuple[Array, Array]:
-        """Range or range rate (n,) of every row to one end, and its Jacobian (n, w) to that end's columns."""
+    def _one_way(self, r: Array, v: Array, sat: Array, vel: Array) -> tuple[Array, Array, Array]:
+        """Range or range rate (n,) of every row to its point r, v (m, 3), its gradient by r (n, 3), and the direction (n, 3)."""
         at, is_rate = self.point_rover, self.rows.kind == DOPPLER
-        p = end.vehicle.points(end.query, velocity=bool(np.any(is_rate)))
-        d = sat - p.r_n[at]
+        d = sat - r[at]
         rho = np.linalg.norm(d, axis=1)
         e = d / rho[:, None]
-        rel = vel - p.v_n[at]
+        rel = vel - v[at]
         rate = np.einsum("ni,ni->n", e, rel)
         # d rate / d r = -(rel - e (e . rel)) / rho
-        by_position = np.where(is_rate[:, None], -(rel - e * rate[:, None]) / rho[:, None], -e)
-        J = _point_jacobians(at, by_position, is_rate, -e, p.J_r, p.J_v)
-        return np.where(is_rate, rate, rho), J
+        by_r = np.where(is_rate[:, None], -(rel - e * rate[:, None]) / rho[:, None], -e)
+        return np.where(is_rate, rate, rho), by_r, e
+
+    def _jacobian(self, by_r: Array, e: Array, point: Point) -> Array:
+        return np.asarray(_point_jacobians(self.point_rover, by_r, self.rows.kind == DOPPLER, -e, point.J_r, point.J_v))
 
     def columns(self, f: int) -> list[Array]:
         matrix = self._entries().matrix(f)

@@ -47,6 +47,7 @@ from factorgraph.models.gnss import (
     prepare,
     single_point,
     system_of,
+    without_ionosphere,
 )
 from factorgraph.problem import Antenna, Link, NavigationProblem, RangeModel, Vec3, Vehicle
 from factorgraph.start import interpolate
@@ -64,6 +65,7 @@ class Receiver:
     point: SinglePoint
     clock_s: Array  # (m,) interpolated over epochs without a solution
     prepared: Prepared
+    differenced: Prepared  # the same as the receiver's links difference them
     usable: BoolArray  # (n,) rows above the mask, strong enough, with a satellite state
 
     @property
@@ -83,6 +85,8 @@ class GnssLink:
 
     link: Link
     block: GnssBlock
+    row_reference: IntArray  # (n,) row of the block -> row of the reference's stream
+    row_rover: IntArray
     arc_group: IntArray  # (arcs,) clock group of each arc
     arc_satellite: list[str]
     arc_signal: list[str]
@@ -109,13 +113,13 @@ def receivers(problem: NavigationProblem) -> dict[str, Receiver]:
     for v in problem.vehicles:
         if v.gnss is None:
             continue
-        stream, noise = v.gnss.stream, v.gnss.noise
+        stream = v.gnss.stream
         if not np.any(np.isfinite(stream.sat_pos_ecef)):
             raise InputError(
                 f"vehicle {v.name}: no satellite has an ephemeris; check that the navigation file covers the flight's time"
             )
-        klobuchar = stream.klobuchar if settings.ionosphere_model == "broadcast" else None
-        point = single_point(stream, noise, settings.systems, klobuchar, problem.t0.sow)
+        klobuchar = stream.klobuchar if settings.ionosphere_model != "none" else None
+        point = single_point(stream, v.gnss.noise, settings.systems, klobuchar, problem.t0.sow)
         good = np.isfinite(point.clock_s)
         if not np.any(good):
             most = int(point.n_sat.max()) if len(point.n_sat) else 0
@@ -128,16 +132,25 @@ def receivers(problem: NavigationProblem) -> dict[str, Receiver]:
             r_n = np.tile(np.asarray(v.fixed_n, float), (len(stream.t_s), 1))
         else:
             r_n = interpolate(stream.t_s, stream.t_s, problem.frame.from_ecef(point.r_ecef))
-        prepared = prepare(stream, problem.frame, r_n, clock, klobuchar, problem.t0.sow)
-        usable = (
-            np.isin(system_of(stream), list(settings.systems))
-            & (prepared.elevation_rad >= noise.elevation_mask_rad)
-            & ~(stream.cn0_dbhz < noise.min_cn0_dbhz)
-            & np.all(np.isfinite(prepared.sat_n), axis=1)
-            & np.isfinite(stream.sat_clock_m)
-        )
-        out[v.name] = Receiver(v, point, clock, prepared, usable)
+        out[v.name] = _receiver(problem, v, point, clock, r_n)
     return out
+
+
+def _receiver(problem: NavigationProblem, vehicle: Vehicle, point: SinglePoint, clock_s: Array, r_n: Array) -> Receiver:
+    """A receiver's rows corrected at antenna positions r_n (m, 3)."""
+    assert vehicle.gnss is not None
+    stream, noise, settings = vehicle.gnss.stream, vehicle.gnss.noise, problem.settings
+    klobuchar = stream.klobuchar if settings.ionosphere_model != "none" else None
+    prepared = prepare(stream, problem.frame, r_n, clock_s, klobuchar, problem.t0.sow)
+    usable = (
+        np.isin(system_of(stream), list(settings.systems))
+        & (prepared.elevation_rad >= noise.elevation_mask_rad)
+        & ~(stream.cn0_dbhz < noise.min_cn0_dbhz)
+        & np.all(np.isfinite(prepared.sat_n), axis=1)
+        & np.isfinite(stream.sat_clock_m)
+    )
+    differenced = prepared if settings.ionosphere_model == "broadcast" else without_ionosphere(prepared)
+    return Receiver(vehicle, point, clock_s, prepared, differenced, usable)
 
 
 def _gnss_rows(
@@ -208,10 +221,12 @@ def link_block(
     )
     arc_row = np.full(len(row), -1, np.int64)
     arc_row[kind == PHASE] = np.unique(arc[row][kind == PHASE], return_inverse=True)[1]
+    rover = Endpoint(ends[link.rover], ends[link.rover].query(t_rover, rov.lever_b))
+    reference = Endpoint(ends[link.reference], ends[link.reference].query(t_ref, ref.lever_b))
     block = GnssBlock(
         rows,
-        rover=Endpoint(ends[link.rover], ends[link.rover].query(t_rover, rov.lever_b)),
-        reference=Endpoint(ends[link.reference], ends[link.reference].query(t_ref, ref.lever_b)),
+        rover=rover,
+        reference=reference,
         point_rover=factor_of,
         z=z,
         sat_rover=rov.prepared.sat_n[rb],
@@ -220,8 +235,10 @@ def link_block(
         vel_reference=np.nan_to_num(ref.prepared.sat_vel_n[ra]),
         wavelength_m=b.stream.wavelength_m[rb],
         arc=arc_row,
+        place_n=None if ref.vehicle.is_fixed else reference.vehicle.points(reference.query).r_n,
     )
-    data = GnssLink(link, block, np.zeros(0, np.int64), [], [], np.zeros(0), np.zeros(0), slips=arcs.slips, key_base=key_base)
+    none = np.zeros(0)
+    data = GnssLink(link, block, ra, rb, none.astype(np.int64), [], [], none, none, slips=arcs.slips, key_base=key_base)
     describe_arcs(data)
     return data
 
@@ -261,16 +278,50 @@ def _differences(
     na, nb = ref.antenna.noise, rov.antenna.noise
     moving = np.all(np.isfinite(rov.prepared.sat_vel_n[rb]), axis=1)
     parts = []
-    for kind, name, sigma_a, sigma_b in (
-        (CODE, "code_m", na.code_m, nb.code_m),
-        (PHASE, "phase_m", na.phase_m, nb.phase_m),
-        (DOPPLER, "rate_mps", na.doppler_mps, nb.doppler_mps),
+    for kind, sigma_a, sigma_b in (
+        (CODE, na.code_m, nb.code_m),
+        (PHASE, na.phase_m, nb.phase_m),
+        (DOPPLER, na.doppler_mps, nb.doppler_mps),
     ):
-        z = getattr(rov.prepared, name)[rb] - getattr(ref.prepared, name)[ra]
+        z = _difference(ref, rov, kind, ra, rb)
         use = np.flatnonzero(arc >= 0 if kind == PHASE else inside & np.isfinite(z) & (moving | (kind == CODE)))
         parts.append((use, np.full(len(use), kind), z[use], np.hypot(sigma_a * scale_a, sigma_b * scale_b)[use]))
     row, kinds, z, sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
     return row, kinds, z, sigma
+
+
+def _difference(ref: Receiver, rov: Receiver, kind: int, ra: IntArray, rb: IntArray) -> Array:
+    """Rover minus reference (n,) of one kind for rows of the two."""
+    name = {CODE: "code_m", PHASE: "phase_m", DOPPLER: "rate_mps"}[kind]
+    return np.asarray(getattr(rov.differenced, name)[rb] - getattr(ref.differenced, name)[ra])
+
+
+def correct_again(
+    problem: NavigationProblem, data: GnssLink, rx: dict[str, Receiver], ends: dict[str, VehicleVariables]
+) -> float:
+    """Correct a link's rows where the trajectories put the antennas now; returns the largest change [m].
+
+    Single points of rover and reference, which the first correction uses, differ by metres in height; the tropospheres
+    then differ by millimetres, and the height of the baseline by three times that.
+    """
+    ref, rov = (_receiver_at(problem, rx[name], ends[name]) for name in (data.link.reference, data.link.rover))
+    block = data.block
+    z = block.z.copy()
+    for kind in (CODE, PHASE):
+        mine = np.flatnonzero(block.rows.kind == kind)
+        z[mine] = _difference(ref, rov, kind, data.row_reference[mine], data.row_rover[mine])
+    change = float(np.abs(z - block.z).max())
+    block.z = z
+    return change
+
+
+def _receiver_at(problem: NavigationProblem, rx: Receiver, vehicle: VehicleVariables) -> Receiver:
+    """A receiver corrected at its antenna's current positions."""
+    if vehicle.mode == "fixed":
+        return rx
+    antenna = vehicle.r if vehicle.mode == "motion" else vehicle.r + vehicle.R @ np.asarray(rx.lever_b)
+    r_n = interpolate(rx.antenna.stream.t_s, vehicle.t_s, antenna)
+    return _receiver(problem, rx.vehicle, rx.point, rx.clock_s, r_n)
 
 
 def describe_arcs(data: GnssLink) -> None:
@@ -513,6 +564,8 @@ class Built:
 
     graph: Graph
     links: list[GnssLink]
+    receivers: dict[str, Receiver]
+    ends: dict[str, VehicleVariables]
 
 
 def native_factors(graph: Graph) -> None:
@@ -575,4 +628,4 @@ def build(
     progress(0.5)
     native_factors(graph)
     progress(1.0)
-    return Built(graph, links)
+    return Built(graph, links, rx, ends)

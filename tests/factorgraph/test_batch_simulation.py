@@ -239,7 +239,7 @@ def test_roles_may_be_swapped(seed: int) -> None:
     r2, v2 = relative(other, "a", "b")
     np.testing.assert_allclose(r2, r, atol=2e-5)
     np.testing.assert_allclose(v2, v, atol=2e-5)
-    np.testing.assert_allclose(np.diagonal(ba.P, axis1=1, axis2=2), np.diagonal(ab.P, axis1=1, axis2=2), rtol=0.1)
+    np.testing.assert_allclose(np.diagonal(ba.P, axis1=1, axis2=2), np.diagonal(ab.P, axis1=1, axis2=2), rtol=0.2)
     np.testing.assert_array_equal(ab.fix, ba.fix)
     # nothing absolute in the solution is no worse baseline: the start needs it all the same
     assert np.abs(r - true_baseline(flight, ab)[0]).max() < 0.04

@@ -5,6 +5,7 @@ Two short simulated flights are written once; each test damages a copy.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -113,6 +114,7 @@ class Run:
 
     code: int
     err: list[str]  # lines
+    printed: str
     out: Path
 
     @property
@@ -133,7 +135,8 @@ def relnav(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) 
         out = Path(str(argv[0])).parent / "out"
         more = ["--no-report", "--out", str(out)] if command == "smooth" else []
         code = cli.main([command, *map(str, argv), *more])
-        return Run(code, capsys.readouterr().err.splitlines(), out)
+        printed, err = capsys.readouterr()
+        return Run(code, err.splitlines(), printed, out)
 
     return run
 
@@ -202,6 +205,10 @@ def satellites(file: str, systems: str, most: int = 99, first: int = 0, last: in
     return content(file, change)
 
 
+def missing(file: str) -> Damage:
+    return lambda folder: (folder / file).unlink()
+
+
 def both(*damages: Damage) -> Damage:
     return lambda folder: [damage(folder) for damage in damages]
 
@@ -233,7 +240,7 @@ def one_error_line(run: Run) -> str:
 
 WRONG: dict[str, tuple[Damage, tuple[str, ...]]] = {
     **{f"empty {file}": (content(file, lambda _: b""), (file, "key is needed" if file == TOML else "empty")) for file in FILES},
-    **{f"missing {file}": (lambda folder, file=file: (folder / file).unlink(), (file,)) for file in FILES},
+    **{f"missing {file}": (missing(file), (file,)) for file in FILES},
     **{
         f"prose in {file}": (
             content(file, lambda _: b"Dear diary,\ntoday we drove\nround the field.\n"),
@@ -396,7 +403,6 @@ DEGRADED: dict[str, tuple[Damage, tuple[str, ...]]] = {
         ("18.8 s are left out", "degraded: base-rover: no usable carrier phase"),
     ),
     "almost no satellites": (satellites(ROVER_OBS, "G", 4), ("only 4 common satellites", "degraded: base-rover:")),
-    "base 100 m off": (key("local_m = [0.0", "local_m = [100.0"), ("base: the declared position is 100 m", "degraded:")),
     "long IMU gap": (
         rows(IMU, lambda body: body[:301] + body[451:]),
         ("degraded: rover: no IMU samples from 6.00 to 9.02 s",),
@@ -413,6 +419,14 @@ def test_a_poor_result_is_written_with_its_reasons_and_1(case: str, flight: Path
     assert run.code == guard.DEGRADED, run.err
     assert all(part in " ".join(run.err) for part in parts), run.err
     assert np.all(np.isfinite(run.solution.pairs[0].baseline_enu))
+
+
+def test_a_base_somewhat_off_is_doubted(flight: Path, relnav: Relnav) -> None:
+    key("local_m = [0.0", "local_m = [100.0")(flight)
+    run = relnav("check", flight, "--json")
+    assert run.code == guard.DONE
+    (note,) = (row["notes"] for row in json.loads(run.printed)["reading"] if row["source"] == "base")
+    assert note == "the declared position is 100 m from where its observations place it"
 
 
 @pytest.mark.parametrize("seed", range(24))
@@ -551,7 +565,7 @@ def test_a_full_disk_leaves_earlier_results_and_no_half_flight(flight: Path, tmp
     for argv in (("smooth", flight, "--out", out), ("simulate", scenario, tmp_path / "simulated")):
         with _process(argv, tmp_path, limited) as process:
             err = process.communicate(timeout=60)[1]
-        assert "File too large" in one_error_line(Run(process.returncode, err.splitlines(), out))
+        assert "File too large" in one_error_line(Run(process.returncode, err.splitlines(), "", out))
     assert _files(out) == before
     assert not (tmp_path / "simulated" / TOML).exists()
 
@@ -567,3 +581,15 @@ def test_ctrl_c_at_any_time_is_one_line_and_130(after_s: float, flight: Path, tm
     (line,) = err.splitlines()
     assert line.startswith("relnav: stopped")
     assert not (tmp_path / "out").exists()
+
+
+def test_an_error_that_an_interrupt_caused_is_not_told_as_a_bug(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A native library that is interrupted while it loads ends with an ImportError of its own."""
+    monkeypatch.setattr(guard, "is_stopping", lambda: True)
+    monkeypatch.setattr(os, "_exit", sys.exit)
+    with pytest.raises(SystemExit) as ended:
+        cli._report_bug(ImportError, ImportError("initialization failed"), None)
+    assert ended.value.code == guard.INTERRUPTED
+    assert capsys.readouterr().err == "relnav: stopped\n"
