@@ -76,7 +76,9 @@ def assert_integers_fit(solution: Solution, settings: Settings) -> None:
     _, epoch = np.unique(np.round(t_s, 2), return_inverse=True)
     per_epoch = np.sqrt(np.bincount(epoch, u**2) / np.bincount(epoch))
     assert per_epoch.max() < settings.ambiguity.release_sigma
-    name = np.array([f"{table.source[s]} {table.label[k]}" for s, k in zip(table.source_index[mine], table.label_index[mine], strict=True)])
+    name = np.array(
+        [f"{table.source[s]} {table.label[k]}" for s, k in zip(table.source_index[mine], table.label_index[mine], strict=True)]
+    )
     for i in np.flatnonzero(np.isin(arcs.state, ["fixed", "datum"])):
         inside = (t_s >= arcs.t_start_s[i] - 0.01) & (t_s <= arcs.t_end_s[i] + 0.01)
         own = u[inside & (name == f"{arcs.link[i]} {arcs.signal[i]} {arcs.satellite[i]}")]
@@ -140,7 +142,7 @@ def rtklib() -> tuple[Array, Array, BoolArray]:
     r = pos.ecef()
     assert r is not None
     t0 = problem_of(KINEMATIC).t0
-    return pos.times.gps_s - (t0.week * 604_800 + t0.sow), r, pos.quality == 1
+    return pos.times.since(t0), r, pos.quality == 1
 
 
 def against_rtklib(solution: Solution) -> Array:

@@ -162,7 +162,7 @@ def optimise(
 ) -> Result:
     """Minimise the robust cost from the current values; the result's Bayes net belongs to the last linearisation.
 
-    Converged when the cost falls by less than `tolerance` of itself (plus an absolute 1e-6). The steps are Gauss-Newton
+    Converged when the cost falls by less than `tolerance` of itself plus one. The steps are Gauss-Newton
     while the cost falls; otherwise Levenberg-Marquardt with damping relative to unit information. A problem that only damping
     makes solvable ends as singular, without a Bayes net.
     """
@@ -190,7 +190,7 @@ def optimise(
                 graph.take(before.retract(net.optimize()))
                 new = graph.cost(robust)
                 # robust weights lag one iteration, so near the optimum the cost may rise by next to nothing
-                if np.isfinite(new) and new <= cost * (1 + tolerance) + 1e-6:
+                if np.isfinite(new) and new <= cost + tolerance * (cost + 1):
                     break
                 graph.take(before)
             lam = LAMBDA_START if lam == 0 else lam * 10
@@ -201,6 +201,6 @@ def optimise(
         decrease, cost = cost - new, new
         costs.append(cost)
         progress(iteration + 1, cost)
-        if lam == 0.0 and decrease < tolerance * cost + 1e-6:
+        if lam == 0.0 and decrease < tolerance * (cost + 1):
             return Result(Status.SINGULAR, costs) if singular else Result(Status.CONVERGED, costs, net)
     return Result(Status.MAX_ITERATIONS, costs, net)
