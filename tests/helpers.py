@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,12 @@ def wheel_file(package: str, relative: str) -> Path:
     if not path.exists():
         pytest.skip(f"{package} brings no {relative}")
     return path
+
+
+def interruptible(command: Sequence[str]) -> list[str]:
+    """The command, started so that it hears Ctrl-C even where the tests themselves run with SIGINT ignored."""
+    start = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execvp(sys.argv[1], sys.argv[1:])"
+    return [sys.executable, "-c", start, *command]
 
 
 def numerical_jacobian(f: Callable[[Array], Array], n: int, step: float) -> Array:

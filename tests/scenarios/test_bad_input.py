@@ -25,7 +25,7 @@ from scenarios import cli, guard, solutions
 from scenarios.simulate import simulate
 from scenarios.simulate.scenario import parse
 from scenarios.simulate.write import write_flight
-from tests.helpers import ROOT
+from tests.helpers import ROOT, interruptible
 
 DURATION_S = 20.0
 BASE_AND_ROVER = f"""
@@ -548,7 +548,7 @@ def test_an_output_folder_that_refuses_files_is_told(relnav: Relnav) -> None:
 
 
 def _process(argv: Iterable[object], cwd: Path, prefix: tuple[str, ...] = ()) -> subprocess.Popen[str]:
-    command = [*prefix, sys.executable, "-m", "scenarios", *map(str, argv)]
+    command = interruptible([*prefix, sys.executable, "-m", "scenarios", *map(str, argv)])
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=cwd, env=env, start_new_session=True

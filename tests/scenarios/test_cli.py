@@ -20,7 +20,7 @@ from factorgraph.solution import Solution
 from scenarios import cli, demo, guard, solutions
 from scenarios.metrics import summary_rows
 from scenarios.overrides import override
-from tests.helpers import ROOT
+from tests.helpers import ROOT, interruptible
 from tests.scenarios.solution_example import example_solution
 
 SCENARIO = """
@@ -278,7 +278,7 @@ def test_a_report_that_cannot_be_written_leaves_the_solution(flight: Path) -> No
 def test_an_interrupt_stops_with_130_and_says_what_is_left(send: str, name: str, flight: Path, tmp_path: Path) -> None:
     ready = tmp_path / "ready"
     env = {**_env(), "SLOW_READY": str(ready)}
-    command = _command(("smooth", flight, "--method", "slow"))
+    command = interruptible(_command(("smooth", flight, "--method", "slow")))
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=flight, env=env, start_new_session=True) as process:
         _wait_for(ready)
         started = time.monotonic()
