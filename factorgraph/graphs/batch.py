@@ -27,6 +27,7 @@ from factorgraph.types import Array
 
 START_MOTION = MotionPrior((3.0, 3.0, 3.0))  # for the first graph, vehicles with an IMU
 START_ROBUST = {kind: Robust("huber", 2.0) for kind in ("code", "doppler", "range", "position", "height")}
+WIDENED = (8.0, 4.0, 2.0)
 FIX_ROUNDS = 8
 CORRECTED_M = 1e-4  # change of a correction that is worth another solution
 ROUGH = 1e-3  # tolerance between rounds; only the last solution needs the settings' own
@@ -127,9 +128,9 @@ class Batch:
         settings, graph = problem.settings, built.graph
         clock.stage("float solution", 0.3)
         placed = all(v.is_fixed or v.gnss is not None or v.positions for v in problem.vehicles)
-        convex = None if placed else _convex(settings, graph)  # starts found from ranges alone may be far off
-        if convex is not None:
-            self._settle(replace(problem, settings=convex), graph, clock)
+        # starts found from ranges alone may be far off
+        for wide in [] if placed else _widened(settings, graph):
+            self._settle(replace(problem, settings=wide), graph, clock)
         result = self._settle(problem, graph, clock)
         if max((correct_again(problem, data, built.receivers, built.ends) for data in built.links), default=0.0) > CORRECTED_M:
             result = self._continue(problem, graph, result, clock)
@@ -186,14 +187,19 @@ class Batch:
         return Result(result.status, before.costs + result.costs, result.bayes_net)
 
 
-def _convex(settings: Settings, graph: Graph) -> Settings | None:
-    """Settings with Huber's loss for those that have local minima, None where no measurement uses such a loss."""
+def _widened(settings: Settings, graph: Graph) -> list[Settings]:
+    """Settings whose losses with local minima are wider, the widest first; none where no measurement uses such a loss.
+
+    Source: Blake and Zisserman (1987) for approaching a loss with local minima through smoother ones.
+    """
     kinds = {KINDS[i] for block in graph.blocks for i in np.unique(block.rows.kind).tolist() if i >= 0}
-    redescending = {kind for kind, r in settings.robust.items() if kind in kinds and r.kernel not in ("none", "huber")}
+    redescending = {k: r for k, r in settings.robust.items() if k in kinds and r.kernel not in ("none", "huber")}
     if not redescending:
-        return None
-    huber = {kind: Robust("huber", settings.robust[kind].width) for kind in redescending}
-    return replace(settings, robust={**settings.robust, **huber})
+        return []
+    return [
+        replace(settings, robust={**settings.robust, **{k: replace(r, width=f * r.width) for k, r in redescending.items()}})
+        for f in WIDENED
+    ]
 
 
 class _Clock:
