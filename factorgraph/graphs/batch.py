@@ -27,7 +27,7 @@ from factorgraph.types import Array
 
 START_MOTION = MotionPrior((3.0, 3.0, 3.0))  # for the first graph, vehicles with an IMU
 START_ROBUST = {kind: Robust("huber", 2.0) for kind in ("code", "doppler", "range", "position", "height")}
-WIDENED = (8.0, 4.0, 2.0)
+WIDENED = (8.0, 4.0, 2.0)  # times the width of a loss with local minima, while starts from ranges alone are far off
 FIX_ROUNDS = 8
 CORRECTED_M = 1e-4  # change of a correction that is worth another solution
 ROUGH = 1e-3  # tolerance between rounds; only the last solution needs the settings' own
@@ -154,7 +154,7 @@ class Batch:
                 result = self._continue(problem, graph, result, clock)
             if not fixed.fixed and not released:
                 break
-        return self._continue(problem, graph, result, clock, problem.settings.tolerance), ratio
+        return self._continue(problem, graph, result, clock, settings.tolerance), ratio
 
     def _settle(self, problem: NavigationProblem, graph: Graph, clock: _Clock) -> Result:
         """Optimise, preintegrating again while the biases move away from those preintegrated at."""

@@ -33,6 +33,7 @@ from factorgraph.solution import (
     Status,
     VehicleSolution,
 )
+from factorgraph.start import interpolate
 from factorgraph.types import Array, BoolArray, IntArray
 
 FIXED_DIFFERENCES = 4  # double differences with integers that make an epoch fixed
@@ -161,7 +162,7 @@ def _pair(
 ) -> PairSolution:
     a, b = ends[pair.reference], ends[pair.rover]
     K = len(a.t_s)
-    C = _enu_at(problem, a)
+    C = problem.frame.C_to_enu(a.r)  # n -> east-north-up at the reference
     P = pair_covariance(problem, a, b, cov) if cov is not None else np.full((K, 6, 6), np.nan)
     fix, n_sat, ratios = _pair_fix(pair, links, ends, K, ratio)
     truth, truth_v = _pair_truth(a, b, C)
@@ -180,14 +181,9 @@ def _pair(
     )
 
 
-def _enu_at(problem: NavigationProblem, v: VehicleVariables) -> Array:
-    """Rotations (K, 3, 3) from n to east-north-up at the vehicle."""
-    return problem.frame.C_to_enu(v.r)
-
-
 def pair_covariance(problem: NavigationProblem, a: VehicleVariables, b: VehicleVariables, cov: JointCovariance) -> Array:
     """Covariance (K, 6, 6) of b relative to a, position and velocity, east-north-up at a."""
-    C = _enu_at(problem, a)
+    C = problem.frame.C_to_enu(a.r)  # n -> east-north-up at the reference
     CC = np.zeros((len(C), 6, 6))
     CC[:, :3, :3], CC[:, 3:, 3:] = C, C
     keys = [[key for v in (a, b) for key in v.keys(k)[:2]] for k in range(len(C))]
@@ -211,16 +207,11 @@ def _pair_truth(a: VehicleVariables, b: VehicleVariables, C: Array) -> tuple[Arr
             return None, None
         else:
             outside = (end.t_s < truth.t_s[0] - 1e-6) | (end.t_s > truth.t_s[-1] + 1e-6)
-            r.append(np.where(outside[:, None], np.nan, interpolated(truth.t_s, truth.r_n, end.t_s)))
+            r.append(np.where(outside[:, None], np.nan, interpolate(end.t_s, truth.t_s, truth.r_n)))
             if truth.v_n is not None:
-                v.append(np.where(outside[:, None], np.nan, interpolated(truth.t_s, truth.v_n, end.t_s)))
+                v.append(np.where(outside[:, None], np.nan, interpolate(end.t_s, truth.t_s, truth.v_n)))
     dv = np.einsum("kij,kj->ki", C, v[1] - v[0]) if len(v) == 2 else None
     return np.einsum("kij,kj->ki", C, r[1] - r[0]), dv
-
-
-def interpolated(t: Array, x: Array, at: Array) -> Array:
-    """Columns of x (n, 3) at times, linear."""
-    return np.column_stack([np.interp(at, t, x[:, j]) for j in range(x.shape[1])])
 
 
 def _pair_fix(

@@ -116,11 +116,6 @@ def system_of(stream: GnssStream) -> Array:
     return np.array([s[0] for s in stream.satellites] or [""])[stream.sat]
 
 
-def band_of(stream: GnssStream) -> Array:
-    """Band digit of every row (n,), dtype <U1."""
-    return np.array([s[1] for s in stream.signals] or [""])[stream.signal]
-
-
 def one_code_per_satellite(stream: GnssStream, usable: BoolArray) -> IntArray:
     """Rows with a code, one per epoch and satellite: the lowest band (L1, E1, B1 where tracked)."""
     rows = np.flatnonzero(usable & np.isfinite(stream.code_m) & np.isfinite(stream.sat_clock_m))
