@@ -15,11 +15,12 @@ import numpy as np
 from factorgraph import start
 from factorgraph.graphs import integers
 from factorgraph.graphs.blocks import KINDS
-from factorgraph.graphs.build import Built, Receiver, build, correct_again, native_factors, receivers
+from factorgraph.graphs.build import Built, build, correct_again, native_factors
 from factorgraph.graphs.optimizer import Graph, Result, optimise
 from factorgraph.graphs.result import make_solution
 from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.grid import common_grid
+from factorgraph.models.receivers import Receiver, receivers
 from factorgraph.problem import MotionPrior, NavigationProblem, Robust, Settings
 from factorgraph.registry import Progress
 from factorgraph.solution import Solution, Status

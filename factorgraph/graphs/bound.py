@@ -11,11 +11,12 @@ import numpy as np
 
 from factorgraph.attitude import matrix_from_quat
 from factorgraph.graphs import integers
-from factorgraph.graphs.build import build, receivers
+from factorgraph.graphs.build import build
 from factorgraph.graphs.covariance import JointCovariance
 from factorgraph.graphs.result import pair_covariance
 from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.grid import common_grid
+from factorgraph.models.receivers import receivers
 from factorgraph.problem import NavigationProblem
 from factorgraph.start import interpolate
 from factorgraph.types import Array
