@@ -44,3 +44,22 @@ def cost(robust: Robust | None, t: Array) -> Array:
     if robust.kernel == "geman-mcclure":
         return 0.5 * t * t / (1 + s)
     return np.where(a < c, c * c / 6 * (1 - (1 - np.minimum(s, 1.0)) ** 3), c * c / 6)
+
+
+def igg3(t: Array, c0: float, c1: float, floor: float = 1e-12) -> Array:
+    """IGG-III factors (n,) in [floor, 1] on the weights of standardised residuals: kept, reduced, rejected.
+
+    1 to c0, (c0 / |t|) ((c1 - |t|) / (c1 - c0))^2 to c1, `floor` beyond. Source: Yang, Song and Xu (2002); spec common.md W1.
+    """
+    a = np.maximum(np.abs(t), c0)
+    return np.maximum(np.where(a < c1, c0 / a * ((c1 - a) / (c1 - c0)) ** 2, 0.0), floor)
+
+
+def bifactor(R: Array, w: Array) -> Array:
+    """Covariance (n, n) of correlated rows whose weights are multiplied by sqrt(w_i w_j): R_ij / sqrt(w_i w_j).
+
+    Equals the inverse of the scaled weight matrix and is positive definite for any w > 0. Source: Yang, Song and Xu (2002);
+    spec common.md W2.
+    """
+    s = 1 / np.sqrt(w)
+    return R * s[:, None] * s
