@@ -19,6 +19,7 @@ from factorgraph.measurements import GnssStream, HeightStream, ImuStream, Positi
 
 Vec3 = tuple[float, float, float]
 Kernel = Literal["none", "huber", "cauchy", "geman-mcclure", "tukey"]
+Elevation = Literal["sine", "flat"]
 
 
 def _positive(owner: object, *names: str) -> None:
@@ -46,7 +47,7 @@ class ImuNoise:
 
 @dataclass(frozen=True, slots=True)
 class GnssNoise:
-    """Zenith standard deviations per receiver; sigma^2(el) = sigma0^2 (1 + 1/sin^2 el) / 2."""
+    """Zenith standard deviations per receiver; sigma^2(el) = sigma0^2 (1 + 1/sin^2 el) / 2 where `elevation` is "sine"."""
 
     code_m: float = 0.30
     phase_m: float = 0.003
@@ -55,6 +56,7 @@ class GnssNoise:
     absolute_correlation_s: float = 60.0  # those errors persist: code of nearby epochs counts once
     elevation_mask_rad: float = np.deg2rad(15.0)
     min_cn0_dbhz: float = 0.0
+    elevation: Elevation = "sine"  # "flat": the same at every elevation
 
     def __post_init__(self) -> None:
         _positive(self, "code_m", "phase_m", "doppler_mps", "absolute_code_m", "absolute_correlation_s")

@@ -154,7 +154,7 @@ def single_epoch(data: PairEpochs, k: int, r_reference: Array, settings: FloatSe
     b = b_start
     for _ in range(WLS_STEPS):
         rho, G = e.predict(b)
-        Q_b = np.linalg.inv(G.T @ W @ G)
+        Q_b: Array = np.linalg.inv(G.T @ W @ G)
         b = b + Q_b @ (G.T @ (W @ (e.code - rho)))
     rho, G = e.predict(b)
     # the phase adds as many unknowns as rows: it only sees the ambiguities

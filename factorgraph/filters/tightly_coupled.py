@@ -24,7 +24,7 @@ from factorgraph.filters import kalman
 from factorgraph.filters.inertial import ATT, INERTIAL, POS, VEL, ImuModel, InertialStart, Navigator
 from factorgraph.geodesy import LocalFrame
 from factorgraph.models.receivers import Receiver
-from factorgraph.types import Array
+from factorgraph.types import Array, BoolArray, IntArray
 
 STATES = INERTIAL.extended(clock=1, drift=1)
 CLOCK, DRIFT = STATES["clock"].start, STATES["drift"].start
@@ -34,7 +34,7 @@ CLOCK, DRIFT = STATES["clock"].start, STATES["drift"].start
 class TightSettings:
     """Undifferenced standard deviations and the clock's behaviour."""
 
-    code_m: float = 3.0
+    code_m: float = 30.0
     doppler_mps: float = 0.005
     clock_m: float = 1e5  # standard deviations at the start
     drift_mps: float = 100.0
@@ -113,7 +113,7 @@ def run(
     return track
 
 
-def _rows_by_epoch(epoch: Array, usable: Array, n_epochs: int) -> list[Array]:
+def _rows_by_epoch(epoch: IntArray, usable: BoolArray, n_epochs: int) -> list[IntArray]:
     rows = np.flatnonzero(usable)
     return np.split(rows, np.searchsorted(epoch[rows], np.arange(1, n_epochs)))
 

@@ -10,8 +10,9 @@ have in common, the reference's own error, drops out of differences.
     z = [DD P; DD Phi - lam N; -lam DD D] - predicted,   H = -A_a on dr (P, Phi) and on dv (D)       (delta = estimate - truth)
 
 The main filter is a standard one (SKF) or an adaptive one (AKF), whose predicted covariance is divided by
-alpha = min(1, k0 / statistic of the innovation). Float ambiguities enter with their covariance ("inflated") or as if
-known ("known"). The final baseline is the least-squares one from the phases less the integers where those passed the ratio test,
+alpha = min(1, k0 / statistic of the innovation). While ambiguities are float, their phases are left out ("omitted"), enter
+with the ambiguities' covariance ("inflated") or as if these were known ("known"). An aided subfilter has used the predicted
+baseline, so the last two count it twice: the filter then confirms its own error. The final baseline is the least-squares one from the phases less the integers where those passed the ratio test,
 and the subfilter's own else.
 
 Source: spec aar_two_stage.md (Wu et al. 2022), sections 1, 2.2 and 2.6, errata E3, E4, E7 and E8.
@@ -19,6 +20,7 @@ Source: spec aar_two_stage.md (Wu et al. 2022), sections 1, 2.2 and 2.6, errata 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -58,7 +60,7 @@ class TwoStageSettings:
     is_adaptive: bool = True  # AKF, else SKF
     k0: float = 1.5
     statistic: Statistic = "literal"
-    float_phase: Literal["inflated", "known", "omitted"] = "inflated"
+    float_phase: Literal["inflated", "known", "omitted"] = "omitted"
     robust_main: bool = True  # codes have the weights of the subfilter (1 unless its scheme is robust) here, too
     reference_jumps: bool = False  # count the corrections of the reference's filter as noise of the relative state
 
@@ -159,21 +161,30 @@ def resolve(solution: FloatSolution) -> Resolved:
 
 
 def float_solutions(
-    shared: Shared, scheme: Scheme, settings: FloatSettings, disturbance: Disturbance | None = None
+    shared: Shared,
+    scheme: Scheme,
+    settings: FloatSettings,
+    disturbance: Disturbance | None = None,
+    ins: Sequence[InsBaseline] | None = None,
+    n_epochs: int | None = None,
 ) -> tuple[list[FloatSolution | None], list[Resolved | None]]:
-    """All epochs of a scheme that does not look at the INS (WLS, EKF): the same for every main filter."""
-    if scheme.has_ins:
-        raise ValueError(f"{scheme.value} depends on the main filter")
+    """The subfilter alone, over all epochs or the first `n_epochs`.
+
+    WLS and EKF are the same for every main filter. Aided schemes need the INS baselines of all epochs, for instance
+    imposed ones.
+    """
+    if scheme.has_ins and ins is None:
+        raise ValueError(f"{scheme.value} depends on the main filter: give it INS baselines")
     data, out = shared.data, []
     subfilter = None if scheme is Scheme.WLS else FloatFilter(scheme, settings)
     b = np.zeros(3)
-    for k in range(data.n_epochs):
+    for k in range(n_epochs or data.n_epochs):
         r_a = shared.reference.antenna_n[k]
         if subfilter is None:
             solution = single_epoch(data, k, r_a, settings, b)
         else:
             fault = disturbance.velocity_mps[k] if disturbance and disturbance.target == "subfilter" else None
-            solution = subfilter.step(data, k, r_a, None, fault)
+            solution = subfilter.step(data, k, r_a, None if ins is None else ins[k], fault)
         b = b if solution is None else solution.b_n
         out.append(solution)
     return out, [None if s is None else resolve(s) for s in out]
@@ -185,20 +196,21 @@ def run(
     settings: TwoStageSettings,
     disturbance: Disturbance | None = None,
     floats: tuple[list[FloatSolution | None], list[Resolved | None]] | None = None,
+    n_epochs: int | None = None,
 ) -> TwoStageRun:
-    """One algorithm over the whole flight. floats: what `float_solutions` gave, for schemes without INS."""
+    """One algorithm over the flight, or its first epochs. floats: what `float_solutions` gave, for schemes without INS."""
     data = shared.data
     imu = shared.problem.vehicle(shared.rover).imu
     assert imu is not None
     if floats is None and not scheme.has_ins:
-        floats = float_solutions(shared, scheme, settings.floats, disturbance)
+        floats = float_solutions(shared, scheme, settings.floats, disturbance, n_epochs=n_epochs)
     subfilter = FloatFilter(scheme, settings.floats) if floats is None else None
     nav = Navigator(imu, shared.problem.frame, shared.start, shared.model, float(data.t_rover_s[0]))
     P = np.zeros((INERTIAL.size, INERTIAL.size))
     P[:9, :9], P[9:, 9:] = shared.start.P, shared.model.P
     q = shared.model.density
     out = _empty_run(data)
-    for k in range(data.n_epochs):
+    for k in range(n_epochs or data.n_epochs):
         t = float(data.t_rover_s[k])
         if t > nav.t_s:
             dt = t - nav.t_s

@@ -198,8 +198,9 @@ def _differences(
 ) -> tuple[IntArray, IntArray, Array, Array]:
     """Paired row, kind, difference and standard deviation of every usable observation, kinds one after the other."""
     ra, rb = pairs.a, pairs.b
-    scale_a, scale_b = elevation_scale(ref.prepared.elevation_rad[ra]), elevation_scale(rov.prepared.elevation_rad[rb])
     na, nb = ref.antenna.noise, rov.antenna.noise
+    scale_a = elevation_scale(ref.prepared.elevation_rad[ra], na.elevation)
+    scale_b = elevation_scale(rov.prepared.elevation_rad[rb], nb.elevation)
     moving = np.all(np.isfinite(rov.prepared.sat_vel_n[rb]), axis=1)
     parts = []
     for kind, sigma_a, sigma_b in (
@@ -287,7 +288,7 @@ def absolute_block(problem: NavigationProblem, end: VehicleVariables, rx: Receiv
         return None
     interval = float(np.median(np.diff(stream.t_s))) if len(stream.t_s) > 1 else 1.0
     persist = np.sqrt(max(1.0, noise.absolute_correlation_s / interval))
-    scale = elevation_scale(rx.prepared.elevation_rad[row])
+    scale = elevation_scale(rx.prepared.elevation_rad[row], noise.elevation)
     sigma = np.where(kind == CODE, noise.absolute_code_m * persist, noise.doppler_mps) * scale
     _, factor_of = np.unique(stream.epoch[row], return_inverse=True)
     first = np.concatenate([[0], np.flatnonzero(np.diff(factor_of)) + 1])

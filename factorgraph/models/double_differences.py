@@ -180,7 +180,8 @@ def baseline_from_phase(
 
     Two Gauss-Newton steps: midpoint geometry makes the second one final.
     """
-    b, N = b_start.copy(), np.zeros((3, 3))
+    b = b_start.copy()
+    N: Array = np.zeros((3, 3))
     still = np.zeros(3)
     none = np.zeros_like(sat_a)
     W = np.linalg.inv(R)

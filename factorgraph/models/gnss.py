@@ -24,15 +24,17 @@ from factorgraph.geodesy import C_MPS, OMEGA_E_RPS, LocalFrame
 from factorgraph.measurements import GnssStream
 from factorgraph.models import atmosphere
 from factorgraph.models.differencing import CommonGroups
-from factorgraph.problem import GnssNoise
+from factorgraph.problem import Elevation, GnssNoise
 from factorgraph.types import Array, BoolArray, IntArray
 
 # Order in which a receiver's tracking modes of one band are preferred; a common mode of both receivers comes first.
 ATTRIBUTES = "CPWQXLZSYMNIDBAE"
 
 
-def elevation_scale(el_rad: Array) -> Array:
-    """sigma(el) / sigma(zenith) = sqrt((1 + 1 / sin^2 el) / 2). Source: spec common.md, section 5."""
+def elevation_scale(el_rad: Array, model: Elevation = "sine") -> Array:
+    """sigma(el) / sigma(zenith): sqrt((1 + 1 / sin^2 el) / 2), or 1 where flat. Source: spec common.md, section 5."""
+    if model == "flat":
+        return np.ones_like(el_rad, float)
     return np.sqrt(0.5 * (1 + 1 / np.sin(np.maximum(el_rad, np.deg2rad(3.0))) ** 2))
 
 
@@ -180,7 +182,7 @@ def single_point(stream: GnssStream, noise: GnssNoise, systems: str, klobuchar: 
                 l1 = atmosphere.klobuchar_m(klobuchar, tow0_s + stream.t_s[epoch], lat, lon, az, el)
                 z = z - l1 * (stream.wavelength_m[rows] / WAVELENGTH_L1_M) ** 2
             mask = el > np.deg2rad(5.0)
-            sigma = noise.absolute_code_m * elevation_scale(el)
+            sigma = noise.absolute_code_m * elevation_scale(el, noise.elevation)
         y = z - rho
         u = np.where(mask, np.sqrt(w) / sigma, 0.0)
         dr = _solve_epochs(clocks.project(-e, u), clocks.project(y, u), at_epoch)

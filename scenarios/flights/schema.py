@@ -43,7 +43,7 @@ from factorgraph.attitude import matrix_from_euler
 from factorgraph.errors import InputError
 from factorgraph.geodesy import LocalFrame, ecef_from_geodetic
 from factorgraph.gpstime import GpsTime
-from factorgraph.problem import GnssNoise, ImuNoise, MotionPrior, Settings, Vec3
+from factorgraph.problem import Elevation, GnssNoise, ImuNoise, MotionPrior, Settings, Vec3
 from factorgraph.types import Array
 
 FILE_NAME = "flight.toml"
@@ -323,6 +323,7 @@ class GnssNoiseTable(Table):
     absolute_correlation_s: PositiveFloat | None = None
     elevation_mask_deg: float | None = Field(default=None, ge=0, lt=90)
     min_cn0_dbhz: float | None = None
+    elevation: Elevation | None = None
 
     @property
     def noise(self) -> GnssNoise:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from factorgraph.measurements import ImuStream
 from factorgraph.problem import ImuNoise, Link, MotionPrior, NavigationProblem, Vehicle
 from scenarios.flights.navigation import Navigation, builtin_constellation
 from scenarios.flights.schema import Flight
@@ -39,20 +40,38 @@ class SimulatedFlight:
     navigation: Navigation  # broadcast messages of the flight
 
 
-def simulate(scenario: Scenario, seed: int) -> SimulatedFlight:
+@dataclass(frozen=True, slots=True)
+class Exact:
+    """Motion and inertial measurements without errors, by vehicle; no seed changes them unless a vehicle sways."""
+
+    trajectories: dict[str, Trajectory]
+    imu: dict[str, ImuStream]
+
+
+def exact(scenario: Scenario, seed: int) -> Exact:
+    """The errorless part of a simulation. Raises InputError as `simulate` does."""
+    info, streams = scenario.scenario, Streams(seed)
+    tables = {v.name: v.trajectory for v in scenario.vehicle}
+    rngs = {name: (streams / name)("motion") for name in tables}
+    paths = trajectory.build(tables, info.duration_s, rngs, info.origin.frame)
+    sensed = {v.name: v.imu for v in scenario.vehicle if v.imu is not None}
+    return Exact(paths, {n: imu.exact(table, paths[n], info.origin.frame, info.duration_s) for n, table in sensed.items()})
+
+
+def simulate(scenario: Scenario, seed: int, known: Exact | None = None) -> SimulatedFlight:
     """Simulate a scenario; the same seed gives the same numbers.
 
-    Raises InputError where parts of the scenario contradict each other.
+    known: what `exact` gave for the same vehicles, to save time over many seeds. Raises InputError where parts of the
+    scenario contradict each other.
     """
     info = scenario.scenario
     streams = Streams(seed)
-    tables = {v.name: v.trajectory for v in scenario.vehicle}
-    trajectories = trajectory.build(tables, info.duration_s, {name: (streams / name)("motion") for name in tables})
+    known = known or exact(scenario, seed)
     sky = _sky(scenario, streams)
-    record = Record(trajectories, {}, {}, ())
-    vehicles = tuple(_vehicle(v, scenario, sky, streams / v.name, record) for v in scenario.vehicle)
+    record = Record(known.trajectories, {}, {}, ())
+    vehicles = tuple(_vehicle(v, scenario, sky, streams / v.name, known, record) for v in scenario.vehicle)
     ranges = [
-        ranging.simulate(table, trajectories, info.duration_s, streams / f"range {table.name}", info.noise_scale)
+        ranging.simulate(table, known.trajectories, info.duration_s, streams / f"range {table.name}", info.noise_scale)
         for table in scenario.range
     ]
     problem = NavigationProblem(
@@ -70,32 +89,32 @@ def simulate(scenario: Scenario, seed: int) -> SimulatedFlight:
 
 def _sky(scenario: Scenario, streams: Streams) -> Sky:
     info, environment = scenario.scenario, scenario.environment
-    navigation = builtin_constellation().shifted_to(info.t0, info.duration_s)
+    navigation = builtin_constellation().shifted_to(info.t0 + -environment.sky_s, environment.sky_s + info.duration_s)
     if environment.ionosphere == 0:
         navigation = replace(navigation, klobuchar=None)
     return Sky(navigation, info.origin.frame, info.t0, info.duration_s, environment, streams / "satellites")
 
 
-def _vehicle(table: VehicleTable, scenario: Scenario, sky: Sky, streams: Streams, record: Record) -> Vehicle:
+def _vehicle(table: VehicleTable, scenario: Scenario, sky: Sky, streams: Streams, known: Exact, record: Record) -> Vehicle:
     """The vehicle with its measurements; fills `record`."""
     info, path = scenario.scenario, record.trajectories[table.name]
     duration, scale = info.duration_s, info.noise_scale
     imu_stream, antenna = None, None
     if table.imu is not None:
-        imu_stream, record.imu[table.name] = imu.simulate(table.imu, path, sky.frame, duration, streams / "imu", scale)
+        imu_stream, record.imu[table.name] = imu.simulate(table.imu, known.imu[table.name], streams / "imu", scale)
     if table.gnss is not None:
         antenna, record.gnss[table.name] = gnss.simulate(table.gnss, sky, path, streams / "gnss", scale)
     return Vehicle(
         name=table.name,
         imu=imu_stream,
-        imu_noise=table.imu.noise.noise if table.imu else ImuNoise(),
+        imu_noise=table.imu.told.noise if table.imu else ImuNoise(),
         gnss=antenna,
         positions=tuple(fixes.positions(p, path, duration, streams / p.name, scale) for p in table.positions),
         heights=tuple(fixes.heights(h, path, duration, streams / h.name, scale) for h in table.heights),
         motion=table.motion.prior if table.motion else MotionPrior(),
         fixed_n=_fixed(table, path),
-        truth=path.truth(fixes.epochs(info.truth_hz, 0.0, duration)),
-        heading_hint_rad=float(path.euler(0.0)[2]) if table.heading_hint else None,
+        truth=trajectory.truth(path, fixes.epochs(info.truth_hz, 0.0, duration)),
+        heading_hint_rad=float(path.euler(np.zeros(1))[0, 2]) if table.heading_hint else None,
     )
 
 

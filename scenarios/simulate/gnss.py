@@ -9,17 +9,17 @@ time tau, rho is the range from the antenna at t to the satellite at t - tau, tu
 
 T and I are the models that estimators use, times the factors of the environment; errors of broadcast orbits and clocks
 are common to all receivers. Standard deviations grow with 1 / sin(el) as `factorgraph.problem.GnssNoise` says. N is an
-integer, new whenever tracking starts again, and jumps at a cycle slip.
+integer, new whenever tracking starts again, and jumps at a cycle slip. Outliers of single codes come at any time; faults of
+several codes at once in windows of time, also into observations that are there already (`with_code_faults`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
-from scipy.signal import lfilter
 
 from factorgraph import geodesy
 from factorgraph.errors import InputError
@@ -34,13 +34,14 @@ from scenarios.flights.navigation import Navigation
 from scenarios.flights.schema import GnssNoiseTable, Table
 from scenarios.flights.signals import MEGAHERTZ, wavelength_m
 from scenarios.simulate.fixes import epochs
-from scenarios.simulate.streams import Streams
+from scenarios.simulate.streams import Streams, gauss_markov
 from scenarios.simulate.trajectory import Trajectory
 
 SEARCH_S = 60.0  # spacing at which satellites above the horizon are looked for
 SEARCH_MARGIN_RAD = np.deg2rad(2.0)  # more than a satellite moves meanwhile
 INTEGER_RANGE = 1000
 ERROR_NODE_S = 30.0
+SAME_EPOCH_S = 1e-3
 WAVELENGTH_L1_M = wavelength_m("G1C")
 
 Probability = Field(default=0.0, ge=0, le=1)
@@ -52,6 +53,20 @@ class Outage(Table):
     start_s: float
     end_s: float
     satellites: tuple[str, ...] = ()
+
+
+class CodeFaults(Table):
+    """Faults of several codes at every epoch from `start_s` to `end_s`, both included; at least one satellite is hit."""
+
+    start_s: float
+    end_s: float
+    size_m: PositiveFloat  # either sign
+    probability: float = Field(default=0.3, ge=0, le=1)  # of a satellite at an epoch
+    spare_highest: bool = True  # the satellite most in view stays good
+
+    def during(self, t_s: Array) -> BoolArray:
+        """True (n,) at times inside the window."""
+        return (t_s > self.start_s - SAME_EPOCH_S) & (t_s < self.end_s + SAME_EPOCH_S)
 
 
 class ClockTable(Table):
@@ -80,6 +95,7 @@ class GnssTable(Table):
     slip_cycles: PositiveInt = 20  # largest
     lli_probability: float = Field(default=1.0, ge=0, le=1)  # that the receiver flags a slip
     outages: tuple[Outage, ...] = ()
+    code_faults: tuple[CodeFaults, ...] = ()
 
 
 class EnvironmentTable(Table):
@@ -89,6 +105,7 @@ class EnvironmentTable(Table):
     ionosphere: float = Field(default=1.0, ge=0)  # times the broadcast model's delay; 0: none is broadcast either
     satellite_error_m: float = Field(default=0.0, ge=0)  # broadcast orbits and clocks, standard deviation of a range
     satellite_error_s: PositiveFloat = 1800.0
+    sky_s: float = Field(default=0.0, ge=0)  # the constellation has moved on for so long since its nominal sky
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +149,7 @@ class Sky:
         error = np.zeros(len(sat))
         for k, name in enumerate(satellites):
             rows = sat == k
-            unit = _correlated(self.streams(name).normal(0.0, 1.0, len(nodes)), ERROR_NODE_S / self.environment.satellite_error_s)
+            unit = gauss_markov(_white(self.streams(name), len(nodes)), ERROR_NODE_S / self.environment.satellite_error_s)
             error[rows] = np.interp(t_s[rows], nodes, unit)
         return error * self.environment.satellite_error_m
 
@@ -183,7 +200,7 @@ def simulate(
     e, s, k = rows.epoch, rows.sat, rows.signal
     lam = np.array([[wavelength_m(j, sky.navigation.glonass_channels.get(i)) for j in table.signals] for i in names])[s, k]
     el = geometry.el[e, s]
-    scale = noise_scale * elevation_scale(el)
+    scale = noise_scale * elevation_scale(el, table.noise.noise.elevation)
     outlier = noise_scale * rows.drawn("outlier", lambda rng, n: _outliers(table, rng, n))
     sat_clock = geometry.clock_m[e, s] - sky.navigation.group_delay_m(geometry.record[e, s], table.signals, k)
     common = geometry.rho[e, s] + C_MPS * clock_s[e] - sat_clock + geometry.tropo[e, s]
@@ -214,7 +231,37 @@ def simulate(
         klobuchar=sky.navigation.klobuchar,
     )
     record = GnssRecord(integer[e, s, k], outlier, geometry.rho[e, s], el, slips, clock_s, drift)
-    return Antenna(stream, table.lever_b, told(table)), record
+    antenna = Antenna(stream, table.lever_b, told(table))
+    return with_code_faults(antenna, record, table.code_faults, streams, noise_scale)
+
+
+def with_code_faults(
+    antenna: Antenna, record: GnssRecord, faults: Sequence[CodeFaults], streams: Streams, noise_scale: float = 1.0
+) -> tuple[Antenna, GnssRecord]:
+    """The same observations with faults of their codes, which are added to the record's outliers.
+
+    `streams` are the receiver's; a window's numbers depend on its times and on nothing else. All signals of a satellite
+    have the same fault.
+    """
+    stream = antenna.stream
+    fault = noise_scale * sum((_faults_m(f, stream, record.elevation_rad, streams) for f in faults), np.zeros(stream.n_rows))
+    hit = replace(stream, code_m=stream.code_m + fault)
+    return replace(antenna, stream=hit), replace(record, outlier_m=record.outlier_m + fault)
+
+
+def _faults_m(faults: CodeFaults, stream: GnssStream, elevation_rad: Array, streams: Streams) -> Array:
+    """Faults (n,) of one window, row by row of the stream."""
+    shape = (len(stream.t_s), len(stream.satellites))
+    elevation = np.full(shape, -np.inf)
+    elevation[stream.epoch, stream.sat] = elevation_rad
+    open_to = np.isfinite(elevation) & faults.during(stream.t_s)[:, None]
+    if faults.spare_highest:
+        open_to &= elevation < elevation.max(axis=1, keepdims=True)
+    own = streams / f"code faults {faults.start_s:g} to {faults.end_s:g} s"
+    drawn = np.array([own(name).random((2, shape[0])) for name in stream.satellites])
+    chance, sign = np.where(open_to, drawn[:, 0].T, np.inf), np.where(drawn[:, 1].T < 0.5, -1.0, 1.0)
+    hit = open_to & ((chance < faults.probability) | (chance == chance.min(axis=1, keepdims=True)))
+    return np.where(hit, sign * faults.size_m, 0.0)[stream.epoch, stream.sat]
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,7 +310,7 @@ class _Noise:
 def _noise(table: GnssTable, rows: _Rows, scale: Array) -> _Noise:
     noise = table.noise.noise
     step = 1 / (table.rate_hz * table.multipath_s)
-    multipath = table.multipath_m * rows.drawn("multipath", lambda rng, n: _correlated(_white(rng, n), step))
+    multipath = table.multipath_m * rows.drawn("multipath", lambda rng, n: gauss_markov(_white(rng, n), step))
     return _Noise(
         scale * (noise.code_m * rows.drawn("code", _white) + multipath),
         scale * noise.phase_m * rows.drawn("phase", _white),
@@ -283,14 +330,6 @@ def _clock(table: ClockTable, t_s: Array, rng: np.random.Generator) -> tuple[Arr
     drift = table.drift * rate + np.cumsum(table.drift_walk_rts * np.sqrt(dt) * steps)
     mean = 0.5 * (drift + np.concatenate([drift[:1], drift[:-1]]))
     return table.offset_s * start + np.cumsum(mean * dt), drift
-
-
-def _correlated(unit: Array, step: float) -> Array:
-    """Gauss-Markov sequence (n,) of unit variance from white noise; `step` in correlation times."""
-    a = np.exp(-step)
-    drive = np.sqrt(1 - a * a) * unit
-    drive[0] = unit[0]
-    return np.asarray(lfilter([1.0], [1.0, -a], drive))
 
 
 def _outliers(table: GnssTable, rng: np.random.Generator, n: int) -> Array:

@@ -12,6 +12,9 @@ from zlib import crc32
 
 import numpy as np
 from pydantic import Field
+from scipy.signal import lfilter
+
+from factorgraph.types import Array
 
 # of vehicles and sensors: they name random streams and files
 Name = Annotated[str, Field(pattern=r"^\w[\w.-]*$")]
@@ -31,3 +34,14 @@ class Streams:
         """A fresh generator of the named stream."""
         key = crc32(f"{self.name}/{name}".encode())
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(key,)))
+
+
+def gauss_markov(unit: Array, step: float) -> Array:
+    """Gauss-Markov sequences (n, ...) of unit variance from white noise; `step` in correlation times.
+
+    Exact for any step: x[k+1] = a x[k] + sqrt(1 - a^2) w, a = exp(-step). Source: spec common.md, section 4.
+    """
+    a = np.exp(-step)
+    drive = np.sqrt(1 - a * a) * unit
+    drive[0] = unit[0]
+    return np.asarray(lfilter([1.0], [1.0, -a], drive, axis=0))

@@ -1,25 +1,36 @@
-"""Smooth trajectories: waypoints, manoeuvres, formation flight, standstill.
+"""Trajectories: waypoints, manoeuvres, formation flight, standstill, and kinematic flight over the ellipsoid.
 
-Whatever describes a motion is sampled every `NODE_S` and becomes two quintic splines, one of the position in n and one
+Most descriptions of a motion are sampled every `NODE_S` and become two quintic splines, one of the position in n and one
 of pitch, roll and heading. Both are four times continuously differentiable, so specific force and rates are smooth, and
 the trajectory can be evaluated at any time, which measurements with odd time stamps need.
 
 Attitude follows the motion. Heading is along the track and pitch is the climb angle; `coordinated` banks so that no
 specific force acts sideways, tan(roll) = a_right / (g + a_up); `level` keeps the wings level, like a car.
+
+In `kinematic` flight it is the other way round: speed along the front axis and Euler angles against the level at the
+place itself are given, piecewise linear in time, and the position follows on the WGS-84 ellipsoid,
+
+    dL/dt = v_N / (M + h),   dlambda/dt = v_E / ((N + h) cos L),   dh/dt = v_U
+
+Nothing is blended: acceleration and rates step where segments meet, which are best put at sampling instants of the IMU.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from itertools import pairwise
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
 from pydantic import Field, PositiveFloat
+from scipy.integrate import OdeSolution, solve_ivp
 from scipy.interpolate import BSpline, make_interp_spline
 
-from factorgraph.attitude import matrix_from_euler, quat_from_matrix
+from factorgraph import geodesy
+from factorgraph.attitude import euler_from_matrix, matrix_from_euler, quat_from_matrix
 from factorgraph.errors import InputError
+from factorgraph.geodesy import LocalFrame
 from factorgraph.measurements import Truth
 from factorgraph.problem import Vec3
 from factorgraph.types import Array
@@ -30,6 +41,8 @@ MARGIN_S = 2.0  # before the start and after the end, for receivers whose clocks
 STANDARD_GRAVITY = 9.80665
 SLOW_MPS = 0.5  # below, the track does not tell the heading
 TURN_SMOOTHING_S = 2.0  # of headings found around a standstill
+ODE_STEP_S = 5.0  # largest, of an eighth-order method: rounding only
+ODE_TOLERANCE_M = 1e-9
 BLENDS = 3  # passes of the moving average that blends manoeuvres: the profiles become twice differentiable
 
 Follow = Literal["coordinated", "level"]
@@ -101,7 +114,31 @@ class Static(Table):
     heading_deg: float = 0.0
 
 
-TrajectoryTable = Annotated[Waypoints | Manoeuvres | Formation | Static, Field(discriminator="kind")]
+class Rates(Table):
+    """Acceleration along the front axis and rates of the Euler angles; what is not given stays as it is."""
+
+    duration_s: PositiveFloat
+    accel_mps2: float = 0.0
+    roll_dps: float = 0.0  # right wing down
+    pitch_dps: float = 0.0  # nose up
+    yaw_dps: float = 0.0  # to the right
+
+
+class Kinematic(Table):
+    """Flight along the front axis; angles against the level at the place itself, whatever forces that takes."""
+
+    kind: Literal["kinematic"]
+    lat_deg: float = Field(gt=-90, lt=90)  # at the start, like all below
+    lon_deg: float = Field(ge=-360, le=360)
+    h_m: float  # above the ellipsoid
+    heading_deg: float = 0.0
+    pitch_deg: float = 0.0
+    roll_deg: float = 0.0
+    speed_mps: float = Field(ge=0)
+    segments: tuple[Rates, ...] = Field(min_length=1)
+
+
+TrajectoryTable = Annotated[Waypoints | Manoeuvres | Formation | Static | Kinematic, Field(discriminator="kind")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,30 +156,89 @@ class Motion:
         return self.r_n + self.C_nb @ lever, self.v_n + np.einsum("nij,nj->ni", self.C_nb, np.cross(self.w_nb_b, lever))
 
 
-@dataclass(frozen=True, slots=True)
-class Trajectory:
-    """Quintic splines of position in n and of pitch, roll and heading (continuous, without jumps of 2 pi)."""
-
-    position: BSpline
-    euler: BSpline
+class Trajectory(Protocol):
+    """A motion that is known at any time of the flight and a little before and after."""
 
     def at(self, t_s: Array) -> Motion:
-        """The motion at any times (n,) within the flight."""
-        r, v, euler, rate = (np.asarray(s(t_s, nu)) for s in (self.position, self.euler) for nu in (0, 1))
-        (th, ga, psi), (dth, dga, dpsi) = euler.T, rate.T
-        # rates about the heading, then the pitch, then the roll axis, turned into the body
-        up = -dpsi * np.cos(th)
-        w = np.stack([np.cos(ga) * dth - np.sin(ga) * up, dga - dpsi * np.sin(th), np.sin(ga) * dth + np.cos(ga) * up], axis=-1)
-        return Motion(r, v, matrix_from_euler(th, ga, psi), w)
+        """The motion at times (n,)."""
 
-    def truth(self, t_s: Array) -> Truth:
-        """The reference at times (n,)."""
-        motion = self.at(t_s)
-        return Truth(t_s, motion.r_n, motion.v_n, quat_from_matrix(motion.C_nb))
+    def euler(self, t_s: Array) -> Array:
+        """Pitch, roll and heading in n (n, 3); the heading continuous, without jumps of 2 pi."""
 
 
-def build(tables: dict[str, TrajectoryTable], duration_s: float, rngs: dict[str, np.random.Generator]) -> dict[str, Trajectory]:
-    """Trajectories of all vehicles by name, leaders before their followers.
+def truth(trajectory: Trajectory, t_s: Array) -> Truth:
+    """The reference at times (n,)."""
+    motion = trajectory.at(t_s)
+    return Truth(t_s, motion.r_n, motion.v_n, quat_from_matrix(motion.C_nb))
+
+
+@dataclass(frozen=True, slots=True)
+class SplineTrajectory:
+    """Quintic splines of position in n and of pitch, roll and heading."""
+
+    position: BSpline
+    angles: BSpline
+
+    def at(self, t_s: Array) -> Motion:
+        """The motion at times (n,)."""
+        r, v, euler, rate = (np.asarray(s(t_s, nu)) for s in (self.position, self.angles) for nu in (0, 1))
+        return Motion(r, v, matrix_from_euler(*euler.T), _body_rate(euler, rate))
+
+    def euler(self, t_s: Array) -> Array:
+        """Pitch, roll and heading (n, 3)."""
+        return np.asarray(self.angles(t_s))
+
+
+@dataclass(frozen=True, slots=True)
+class KinematicTrajectory:
+    """Speed and Euler angles against the local level, linear between nodes and held beyond them, and the way they lead."""
+
+    frame: LocalFrame
+    start: tuple[float, float, float]  # latitude, longitude, height
+    nodes: Array  # (k,) [s]
+    speed: Array  # (k,)
+    angles: Array  # (k, 3) pitch, roll, heading against the local level
+    moved: OdeSolution  # what `_geodetic` adds to the start
+
+    def at(self, t_s: Array) -> Motion:
+        """The motion at times (n,)."""
+        lat, lon, h = _geodetic(self.start, np.asarray(self.moved(t_s)))
+        r = self.frame.from_ecef(geodesy.ecef_from_geodetic(lat, lon, h))
+        C_nl = np.swapaxes(self.frame.C_to_enu(r), 1, 2)
+        euler, rate = self._level(t_s)
+        C_lb = matrix_from_euler(*euler.T)
+        v = np.interp(t_s, self.nodes, self.speed)[:, None] * C_lb[:, :, 1]
+        M, N = _radii(lat)
+        w_nl = np.column_stack([-v[:, 1] / (M + h), v[:, 0] / (N + h), v[:, 0] * np.tan(lat) / (N + h)])
+        w = _body_rate(euler, rate) + np.einsum("nji,nj->ni", C_lb, w_nl)
+        return Motion(r, np.einsum("nij,nj->ni", C_nl, v), C_nl @ C_lb, w)
+
+    def euler(self, t_s: Array) -> Array:
+        """Pitch, roll and heading in n (n, 3)."""
+        level = self._level(t_s)[0][:, 2]
+        pitch, roll, heading = euler_from_matrix(self.at(t_s).C_nb)
+        return np.column_stack([pitch, roll, level + np.mod(heading - level + np.pi, 2 * np.pi) - np.pi])
+
+    def _level(self, t_s: Array) -> tuple[Array, Array]:
+        """Angles against the local level and their rates (n, 3)."""
+        euler = np.column_stack([np.interp(t_s, self.nodes, angle) for angle in self.angles.T])
+        slope = np.diff(self.angles, axis=0) / np.diff(self.nodes)[:, None]
+        held = np.zeros((1, 3))
+        return euler, np.concatenate([held, slope, held])[np.searchsorted(self.nodes, t_s, side="right")]
+
+
+def _body_rate(euler: Array, rate: Array) -> Array:
+    """Rate (n, 3) of the body in its own axes, from pitch, roll and heading and their rates (n, 3)."""
+    (th, ga, _), (dth, dga, dpsi) = euler.T, rate.T
+    # about the heading, then the pitch, then the roll axis, turned into the body
+    up = -dpsi * np.cos(th)
+    return np.stack([np.cos(ga) * dth - np.sin(ga) * up, dga - dpsi * np.sin(th), np.sin(ga) * dth + np.cos(ga) * up], axis=-1)
+
+
+def build(
+    tables: dict[str, TrajectoryTable], duration_s: float, rngs: dict[str, np.random.Generator], frame: LocalFrame
+) -> dict[str, Trajectory]:
+    """Trajectories of all vehicles by name, in `frame`, leaders before their followers.
 
     rngs: one generator per vehicle, for what wanders. Raises InputError for unknown leaders and for circles of followers.
     """
@@ -152,7 +248,11 @@ def build(tables: dict[str, TrajectoryTable], duration_s: float, rngs: dict[str,
     while left:
         ready = [name for name, table in left.items() if not isinstance(table, Formation) or table.leader in done]
         for name in ready:
-            done[name] = _build(name, left.pop(name), nodes, duration_s, rngs[name], done)
+            table = left.pop(name)
+            if isinstance(table, Kinematic):
+                done[name] = _kinematic(name, table, duration_s, frame)
+            else:
+                done[name] = _splined(name, table, nodes, duration_s, rngs[name], done)
         if not ready:
             name, table = next((n, t) for n, t in left.items() if isinstance(t, Formation))
             reason = "follows itself in a circle" if table.leader in tables else f"there are {', '.join(tables)}"
@@ -160,9 +260,14 @@ def build(tables: dict[str, TrajectoryTable], duration_s: float, rngs: dict[str,
     return {name: done[name] for name in tables}
 
 
-def _build(
-    name: str, table: TrajectoryTable, nodes: Array, duration_s: float, rng: np.random.Generator, done: dict[str, Trajectory]
-) -> Trajectory:
+def _splined(
+    name: str,
+    table: Waypoints | Manoeuvres | Formation | Static,
+    nodes: Array,
+    duration_s: float,
+    rng: np.random.Generator,
+    done: dict[str, Trajectory],
+) -> SplineTrajectory:
     heading = None
     if isinstance(table, Static):
         r, heading, follow = np.tile(table.r_n, (len(nodes), 1)), np.full(len(nodes), np.deg2rad(table.heading_deg)), "level"
@@ -184,7 +289,7 @@ def _build(
     return _with_attitude(name, nodes, r, follow == "coordinated", heading)
 
 
-def _with_attitude(name: str, nodes: Array, r: Array, banks: bool, heading: Array | None) -> Trajectory:
+def _with_attitude(name: str, nodes: Array, r: Array, banks: bool, heading: Array | None) -> SplineTrajectory:
     position = make_interp_spline(nodes, r, k=5)
     v, a = position(nodes, 1), position(nodes, 2)
     if heading is None:
@@ -192,7 +297,7 @@ def _with_attitude(name: str, nodes: Array, r: Array, banks: bool, heading: Arra
     right = np.column_stack([np.cos(heading), -np.sin(heading)])
     pitch = np.arctan2(v[:, 2], np.hypot(np.hypot(v[:, 0], v[:, 1]), SLOW_MPS))
     roll = np.arctan2(np.sum(a[:, :2] * right, axis=1), STANDARD_GRAVITY + a[:, 2]) if banks else np.zeros(len(nodes))
-    return Trajectory(position, make_interp_spline(nodes, np.column_stack([pitch, roll, heading]), k=5))
+    return SplineTrajectory(position, make_interp_spline(nodes, np.column_stack([pitch, roll, heading]), k=5))
 
 
 def _heading_along(name: str, v: Array) -> Array:
@@ -245,9 +350,7 @@ def _manoeuvred(name: str, table: Manoeuvres, nodes: Array, duration_s: float) -
         for key, factor in (("accel_mps2", 1.0), ("climb_mps", 1.0), ("turn_dps", np.pi / 180), ("bank_deg", np.pi / 180))
     )
     speed = table.speed_mps + _integral(accel, nodes)
-    if speed.min() < -0.01:
-        at = nodes[int(np.argmin(speed))]
-        raise InputError(f"vehicle {name}: its manoeuvres slow it down to {speed.min():.1f} m/s at {at:.0f} s")
+    _check_forward(name, nodes, speed)
     speed = np.maximum(speed, 0.0)
     if np.any(bank != 0):
         turn = turn + STANDARD_GRAVITY * np.tan(bank) / np.maximum(speed, 1.0)
@@ -255,6 +358,62 @@ def _manoeuvred(name: str, table: Manoeuvres, nodes: Array, duration_s: float) -
     level = speed[:, None] * np.column_stack([np.sin(heading), np.cos(heading)])
     r = np.column_stack([_integral(level[:, 0], nodes), _integral(level[:, 1], nodes), _integral(climb, nodes)])
     return table.start_n + r, heading
+
+
+def _check_forward(name: str, t_s: Array, speed: Array) -> None:
+    if speed.min() < -0.01:
+        at = t_s[int(np.argmin(speed))]
+        raise InputError(f"vehicle {name}: its manoeuvres slow it down to {speed.min():.1f} m/s at {at:.0f} s")
+
+
+def _kinematic(name: str, table: Kinematic, duration_s: float, frame: LocalFrame) -> KinematicTrajectory:
+    steps = np.array([s.duration_s for s in table.segments])
+    if steps.sum() < duration_s:
+        raise InputError(f"vehicle {name}: its segments last {steps.sum():g} of {duration_s:g} s; add some")
+    nodes = np.concatenate([[0.0], np.cumsum(steps)])
+    rates = np.array([(s.accel_mps2, s.pitch_dps, s.roll_dps, s.yaw_dps) for s in table.segments])
+    first = np.array([table.speed_mps, table.pitch_deg, table.roll_deg, table.heading_deg])
+    values = first + np.vstack([np.zeros(4), np.cumsum(rates * steps[:, None], axis=0)])
+    speed, angles = values[:, 0], np.deg2rad(values[:, 1:])
+    _check_forward(name, nodes, speed)
+    start = (float(np.deg2rad(table.lat_deg)), float(np.deg2rad(table.lon_deg)), table.h_m)
+    return KinematicTrajectory(frame, start, nodes, speed, angles, _integrated(start, nodes, speed, angles, duration_s))
+
+
+def _integrated(start: tuple[float, float, float], nodes: Array, speed: Array, angles: Array, duration_s: float) -> OdeSolution:
+    """Scaled changes of latitude, longitude and height, piece by piece so that no step crosses a kink."""
+
+    def rate(t: float, moved: Array) -> list[float]:
+        pitch, _, heading = (np.interp(t, nodes, angle) for angle in angles.T)
+        v, (lat, _, h) = np.interp(t, nodes, speed), _geodetic(start, moved)
+        M, N = _radii(lat)
+        level = v * np.cos(pitch)
+        north = level * np.cos(heading) / (M + h)
+        east = level * np.sin(heading) / ((N + h) * np.cos(lat))
+        return [geodesy.A_M * north, geodesy.A_M * east, v * np.sin(pitch)]
+
+    def solved(begin: float, end: float, moved: Array) -> OdeSolution:
+        options = {"method": "DOP853", "max_step": ODE_STEP_S, "rtol": 1e-12, "atol": ODE_TOLERANCE_M, "dense_output": True}
+        return solve_ivp(rate, (begin, end), moved, **options).sol
+
+    ends = np.unique(np.append(nodes[nodes < duration_s], duration_s + MARGIN_S))
+    before = solved(0.0, -MARGIN_S, np.zeros(3))
+    times, pieces, moved = before.ts[::-1], before.interpolants[::-1], np.zeros(3)
+    for begin, end in pairwise(ends.tolist()):
+        piece = solved(begin, end, moved)
+        times, pieces, moved = np.concatenate([times, piece.ts[1:]]), pieces + piece.interpolants, piece(end)
+    return OdeSolution(times, pieces)
+
+
+def _geodetic(start: tuple[float, float, float], moved: Array) -> tuple[Array, Array, Array]:
+    """Latitude, longitude and height of changes (3, ...) in metres, angles times the equator's radius."""
+    return start[0] + moved[0] / geodesy.A_M, start[1] + moved[1] / geodesy.A_M, start[2] + moved[2]
+
+
+def _radii(lat: Array) -> tuple[Array, Array]:
+    """Radii of curvature along the meridian and across it."""
+    w2 = 1 - geodesy.E2 * np.sin(lat) ** 2
+    return geodesy.A_M * (1 - geodesy.E2) / w2**1.5, geodesy.A_M / np.sqrt(w2)
 
 
 def _integral(x: Array, nodes: Array) -> Array:
@@ -285,6 +444,6 @@ def _following(name: str, table: Formation, nodes: Array, rng: np.random.Generat
     motion = leader.at(nodes)
     C = motion.C_nb
     if table.frame == "track":
-        heading = np.asarray(leader.euler(nodes))[:, 2]
+        heading = leader.euler(nodes)[:, 2]
         C = matrix_from_euler(np.zeros(len(nodes)), np.zeros(len(nodes)), heading)
     return np.asarray(motion.r_n + np.einsum("nij,nj->ni", C, offset))

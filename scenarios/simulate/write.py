@@ -64,7 +64,7 @@ def _vehicle(flight: SimulatedFlight, table: VehicleTable, folder: Path) -> sche
     return schema.VehicleTable(
         name=v.name,
         imu=_imu(v.name, v.imu, folder) if v.imu else None,
-        imu_noise=table.imu.noise if table.imu else schema.ImuNoiseTable(),
+        imu_noise=table.imu.told if table.imu else schema.ImuNoiseTable(),
         gnss=_gnss(flight, v, table, folder),
         positions=tuple(_positions(v.name, p, folder) for p in v.positions),
         heights=tuple(_heights(v.name, h, folder) for h in v.heights),

@@ -1,0 +1,1 @@
+"""Scenarios of publications, with their published constants, data sets and faults."""
