@@ -41,19 +41,30 @@ def require_sound(a: Array, Q: Array) -> None:
 
 def raise_fault(code: int, row: int, column: int, value: float, Q: Array) -> NoReturn:
     """ValueError with the words for a kernel's fault."""
+    raise ValueError(fault_text(code, row, column, value, Q))
+
+
+def fault_text(code: int, row: int, column: int, value: float, Q: Array) -> str:
+    """The words for a kernel's fault."""
     if code == kernels.BAD_FLOAT:
-        raise ValueError(f"a_float must be finite; a_float[{row}] is {value}")
+        return f"a_float must be finite; a_float[{row}] is {value}"
     if code == kernels.HUGE_FLOAT:
-        raise ValueError(f"a_float[{row}] = {value:.3g} cycles is too large to carry a fraction; remove a common offset first")
+        return f"a_float[{row}] = {value:.3g} cycles is too large to carry a fraction; remove a common offset first"
     if code == kernels.BAD_COVARIANCE:
-        raise ValueError(f"Q must be finite; Q[{row}, {column}] or its mirror is not")
+        return f"Q must be finite; Q[{row}, {column}] or its mirror is not"
     if code == kernels.ASYMMETRIC:
-        raise ValueError(f"Q must be symmetric; Q[{row}, {column}] - Q[{column}, {row}] = {value:.3g}")
+        return f"Q must be symmetric; Q[{row}, {column}] - Q[{column}, {row}] = {value:.3g}"
     if code == kernels.NOT_POSITIVE:
         smallest = np.linalg.eigvalsh(0.5 * (Q + Q.T))[0]
-        raise ValueError(
+        return (
             f"Q must be positive definite; ambiguity {row} has conditional variance {value:.3g} and the smallest eigenvalue "
             f"is {smallest:.3g} (an ambiguity given twice, or a datum missing?)"
         )
-    condition = np.linalg.cond(Q)
-    raise ValueError(f"Q is too ill-conditioned to decorrelate with exact integers; its condition number is {condition:.1e}")
+    return f"Q is too ill-conditioned to decorrelate with exact integers; its condition number is {np.linalg.cond(Q):.1e}"
+
+
+def at_least_one(name: str, value: int) -> int:
+    """The option as a whole number. Raises ValueError below 1."""
+    if value < 1:
+        raise ValueError(f"{name} must be at least 1, got {value}")
+    return int(value)

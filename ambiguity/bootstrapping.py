@@ -49,11 +49,11 @@ def bootstrap(a_float: ArrayLike, Q: ArrayLike) -> Rounded:
     a, Q = pair(a_float, Q)
     require_sound(a, Q)
     offset, remainder = kernels.split(a)
-    code, row, value, UZ, D, Y, z = kernels.reduce(remainder, Q)
+    code, row, value, U, D, Y, z = kernels.reduce_without_Z(remainder, Q)
     if code != kernels.OK:
         raise_fault(code, row, row, value, Q)
     integers = np.empty(a.size, np.int64)
-    kernels.restore(Y, kernels.round_sequentially(UZ, z), offset, integers)
+    kernels.restore(Y, kernels.round_sequentially(U, z), offset, integers)
     return Rounded(integers, _product_of_rates(D))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ambiguity import _kernels as kernels
-from ambiguity._input import pair, raise_fault
+from ambiguity._input import at_least_one, pair, raise_fault
 from ambiguity.types import Array, IntArray
 
 MAX_NODES = 50_000_000  # about a second
@@ -44,15 +44,10 @@ def integer_least_squares(a_float: ArrayLike, Q: ArrayLike, n_candidates: int = 
     ill-conditioned for exact integers. Source: Teunissen (1995); Chang, Yang and Zhou (2005). Ties keep the first found.
     """
     a, Q = pair(a_float, Q)
-    if n_candidates < 1:
-        raise ValueError(f"n_candidates must be at least 1, got {n_candidates}")
-    if max_nodes < 1:
-        raise ValueError(f"max_nodes must be at least 1, got {max_nodes}")
+    k, budget = at_least_one("n_candidates", n_candidates), at_least_one("max_nodes", max_nodes)
     if a.size == 0:
         return IlsResult(np.zeros((1, 0), np.int64), np.zeros(1), True, 0)
-    code, row, column, value, candidates, norms, proven, nodes = kernels.integer_least_squares(
-        a, Q, int(n_candidates), int(max_nodes)
-    )
+    code, row, column, value, candidates, norms, proven, nodes = kernels.integer_least_squares(a, Q, k, budget)
     if code != kernels.OK:
         raise_fault(code, row, column, value, Q)
     return IlsResult(candidates, norms, proven, nodes)

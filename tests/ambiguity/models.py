@@ -1,22 +1,40 @@
-"""Float ambiguities of realistic short-baseline geometry, and RTKLIB's answer to them."""
+"""Float ambiguities of realistic short-baseline geometry and of random shape, and RTKLIB's answer to them."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from ambiguity import success_rate
 from ambiguity.types import Array, IntArray
 
 WAVELENGTHS_M = (299792458.0 / 1575.42e6, 299792458.0 / 1227.60e6, 299792458.0 / 1176.45e6)
 
 
+MODELS: dict[str, tuple[tuple[int, ...], int, float, float, int]] = {
+    # satellites per system, frequencies, phase and code sigma [m], epochs
+    "n=6 single frequency": ((7,), 1, 0.010, 0.3, 10),
+    "n=8 dual": ((5,), 2, 0.003, 0.3, 1),
+    "n=12 dual": ((7,), 2, 0.003, 0.3, 1),
+    "n=20 dual": ((6, 6), 2, 0.003, 0.3, 1),
+    "n=40 dual": ((8, 8, 7), 2, 0.010, 0.3, 1),
+    "n=60 triple": ((8, 8, 7), 3, 0.010, 0.3, 1),
+}
+
+
 def double_difference_covariance(
-    rng: np.random.Generator, n_sats: tuple[int, ...], n_freq: int, sigma_phase_m: float, sigma_code_m: float, n_epochs: int = 1
+    rng: np.random.Generator,
+    n_sats: tuple[int, ...],
+    n_freq: int,
+    sigma_phase_m: float,
+    sigma_code_m: float,
+    n_epochs: int = 1,
+    weighted: bool = True,
 ) -> Array:
     """Covariance [cyc^2] of the float ambiguities of a baseline from code and phase, nothing known of the baseline.
 
     One reference satellite per system (`n_sats` holds the satellites of each), undifferenced sigmas at the zenith grow
-    with 1 / sin(elevation); epochs share one geometry. With B the double differences' lines of sight:
+    with 1 / sin(elevation) unless not `weighted`; epochs share one geometry. With B the double differences' lines of sight:
     Q_a = (R_phase + B inv(B' inv(R_code) B) B') / (wavelengths).
     """
     B_rows, cofactors = [], []
@@ -26,7 +44,7 @@ def double_difference_covariance(
         u = np.column_stack([np.cos(el) * np.sin(az), np.cos(el) * np.cos(az), np.sin(el)])
         T = np.insert(np.eye(n_sat - 1), top, -1.0, axis=1)
         B_rows.append(T @ u)
-        cofactors.append(2.0 * T @ np.diag(1.0 / np.sin(el) ** 2) @ T.T)
+        cofactors.append(2.0 * T @ np.diag(1.0 / np.sin(el) ** (2 if weighted else 0)) @ T.T)
     n = sum(len(b) for b in B_rows)
     C, at = np.zeros((n, n)), 0
     for c in cofactors:
@@ -51,6 +69,23 @@ def random_covariance(rng: np.random.Generator, n: int, spread: float = 2.0) -> 
     V, _ = np.linalg.qr(rng.standard_normal((n, n)))
     Q = (V * 10.0 ** rng.uniform(-spread, 0.5, n)) @ V.T
     return np.asarray(0.5 * (Q + Q.T))
+
+
+def mixed_covariance(rng: np.random.Generator, n: int) -> Array:
+    """Independent ambiguities of any precision, hidden behind a sparse unimodular change of variables."""
+    lower = np.tril(rng.integers(-2, 3, (n, n)) * (rng.random((n, n)) < 1.5 / n), -1) + np.eye(n)
+    T = lower[:, rng.permutation(n)]
+    Q = (T * 10.0 ** rng.uniform(-3.0, 0.0, n)) @ T.T
+    return np.asarray(0.5 * (Q + Q.T))
+
+
+def with_success_rate(Q: Array, target: float) -> Array:
+    """Q scaled so that the decorrelated, bootstrapped success rate is about `target`."""
+    low, high = 1e-9, 1e9
+    for _ in range(60):
+        middle = np.sqrt(low * high)
+        low, high = (middle, high) if success_rate(middle * Q) > target else (low, middle)
+    return np.asarray(low * Q)
 
 
 class Rtklib:

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguity import FixStatus, condition, decorrelate, fix, integer_least_squares, success_rate
+from ambiguity.partial import fix_ordered
 from ambiguity.types import Array
 from tests.ambiguity.models import double_difference_covariance, draw_float, random_covariance
 
@@ -203,6 +204,86 @@ def test_conditioning_on_all_integers_leaves_nothing_open() -> None:
 def test_wrong_constraints_are_named(Z: object, z: object, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         condition([0.1, 0.2], [[2.0, 0.5], [0.5, 1.0]], Z, z)  # type: ignore[arg-type]
+
+
+def test_low_satellites_are_dropped_until_the_rest_is_sure() -> None:
+    """Noise that grows towards the horizon: high satellites are fixed, each by itself, low ones stay float."""
+    rng = np.random.default_rng(17)
+    seen = 0
+    for _ in range(40):
+        elevation = np.sort(rng.uniform(0.1, 1.5, 8))[::-1]
+        sigma = 0.004 / np.sin(elevation) ** 2
+        Q = np.diag(sigma**2) + 0.02 * np.ones((8, 8)) * np.outer(sigma, sigma)
+        order = rng.permutation(8)
+        Q, elevation = Q[np.ix_(order, order)], elevation[order]
+        a, truth = draw_float(rng, Q)
+        result = fix_ordered(a, Q, elevation)
+        if result.status is not FixStatus.PARTIAL:
+            continue
+        seen += 1
+        assert elevation[result.fixed].min() > elevation[~result.fixed].max()
+        np.testing.assert_array_equal(result.integers[result.fixed], truth[result.fixed])
+        np.testing.assert_array_equal(result.Z_fixed, np.eye(8, dtype=np.int64)[result.fixed])
+        kept = np.flatnonzero(result.fixed)
+        subset = Q[np.ix_(kept, kept)]
+        norms = integer_least_squares(a[kept], subset).norms
+        assert result.ratio == pytest.approx(norms[1] / norms[0], rel=1e-8) and result.ratio >= 3
+        assert result.success_rate == pytest.approx(success_rate(subset)) and result.success_rate >= 0.999
+        # one more would not have passed
+        more = np.sort(np.append(kept, np.flatnonzero(~result.fixed)[np.argmax(elevation[~result.fixed])]))
+        wider = Q[np.ix_(more, more)]
+        norms = integer_least_squares(a[more], wider).norms
+        assert success_rate(wider) < 0.999 or norms[1] / norms[0] < 3
+    assert seen >= 10
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=seeds, n=st.integers(1, 9), p=st.floats(0, 0.9999), ratio=st.floats(1, 4))
+def test_ordered_and_combined_fixing_agree_on_the_whole_set(seed: int, n: int, p: float, ratio: float) -> None:
+    rng = np.random.default_rng(seed)
+    Q = random_covariance(rng, n)
+    a, _ = draw_float(rng, Q)
+    ordered, combined = fix_ordered(a, Q, rng.uniform(0, 1, n), ratio, p), fix(a, Q, ratio, p)
+    assert ordered.success_rate_all == pytest.approx(combined.success_rate_all, rel=1e-12)
+    assert (ordered.status is FixStatus.FIXED) == (combined.status is FixStatus.FIXED)
+    if combined.status is FixStatus.FIXED:
+        np.testing.assert_array_equal(ordered.integers, combined.integers)
+        np.testing.assert_array_equal(ordered.Z_fixed, np.eye(n))
+    np.testing.assert_array_equal(ordered.integers[ordered.fixed], ordered.z)
+    assert np.isnan(ordered.integers[~ordered.fixed]).all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=seeds, n=st.integers(2, 8))
+def test_ordered_fixing_follows_a_permutation(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    Q, priority = random_covariance(rng, n), rng.permutation(n).astype(float)
+    a, _ = draw_float(rng, Q)
+    order = rng.permutation(n)
+    plain, permuted = (
+        fix_ordered(a, Q, priority, 2.0, 0.9),
+        fix_ordered(a[order], Q[np.ix_(order, order)], priority[order], 2.0, 0.9),
+    )
+    assert plain.status is permuted.status
+    np.testing.assert_array_equal(permuted.integers, plain.integers[order])
+
+
+def test_of_equal_priorities_the_later_goes_first() -> None:
+    result = fix_ordered([0.01, 0.4, 0.02, 0.45], np.diag([1e-4, 4.0, 1e-4, 4.0]), [1, 1, 1, 1])
+    assert result.fixed.tolist() == [True, False, False, False]  # ambiguity 1 stands in the way of 2
+    result = fix_ordered([0.01, 0.4, 0.02, 0.45], np.diag([1e-4, 4.0, 1e-4, 4.0]), [np.inf, 1, 2, -np.inf])
+    assert result.fixed.tolist() == [True, False, True, False]
+    assert result.Z_fixed.tolist() == [[1, 0, 0, 0], [0, 0, 1, 0]] and result.z.tolist() == [0, 0]
+
+
+def test_ordered_fixing_of_nothing_and_wrong_priorities() -> None:
+    assert fix_ordered([], np.zeros((0, 0)), []).status is FixStatus.NONE
+    assert fix_ordered([0.5], [[9.0]], [1.0]).status is FixStatus.FLOAT
+    for priority in ([1.0], [1.0, np.nan], [[1.0, 2.0]]):
+        with pytest.raises(ValueError, match="priority must hold 2 numbers"):
+            fix_ordered([0.1, 0.2], np.eye(2), priority)
+    with pytest.raises(ValueError, match="max_nodes must be at least 1"):
+        fix_ordered([0.1], [[1.0]], [1.0], max_nodes=0)
 
 
 def test_wrong_options_are_named() -> None:
