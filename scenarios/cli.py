@@ -1,7 +1,7 @@
 """The command line: parse, call, turn the outcome into an exit code.
 
 Only the standard library is imported here, so that `relnav --help` answers at once; the work is in
-`scenarios.commands` and `scenarios.demo`.
+`scenarios.commands`, `scenarios.demo` and `scenarios.studies.command`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from factorgraph.errors import InputError
 from scenarios import guard
@@ -31,6 +31,7 @@ Examples
   relnav smooth my-flight                   results and report in relnav-out/my-flight
   relnav smooth my-flight --set ambiguity.fix=false --out float-only
   relnav simulate two-uav sim --seed 7      a flight with known truth, then: relnav smooth sim
+  relnav study aar --quick                  estimators compared over several simulated flights
 """
 
 EXIT_CODES = """\
@@ -54,6 +55,7 @@ class Command:
     path: str
     add_options: Callable[[argparse.ArgumentParser], None] | None = None
     guarded: bool = False  # runs in a watched child process
+    more_options: str = ""  # "module:function" that adds to the parser what the options read so far ask for
 
 
 class _Parser(argparse.ArgumentParser):
@@ -119,6 +121,40 @@ def _report_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--figures", action="store_true", help="write figures for print as well (needs matplotlib)")
 
 
+def _study_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", metavar="NAME", nargs="?", help="the study; without one, all are listed")
+    parser.add_argument("--trials", metavar="N", type=_whole(1), help="number of trials (as the study says)")
+    parser.add_argument("--seed", metavar="FIRST", type=_whole(0), default=1, help="seed of the first trial (1)")
+    parser.add_argument("--quick", action="store_true", help="few trials: minutes, and wider intervals")
+    parser.add_argument("--workers", metavar="N", type=_whole(1), help="processes on this computer (one per processor)")
+    parser.add_argument(
+        "--engine", metavar="ENGINE", type=_engine, default="local", help="local, or dask://HOST:PORT for a dask cluster"
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, help=f"folder of the results ({OUT_ROOT}{os.sep}study-NAME)")
+
+
+def _whole(least: int) -> Callable[[str], int]:
+    """The type of a whole number that is not below `least`."""
+
+    def parse(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            number = least - 1
+        if number < least:
+            raise argparse.ArgumentTypeError(f"give a whole number from {least} on, not {text}")
+        return number
+
+    return parse
+
+
+def _engine(text: str) -> str:
+    host, _, port = text.removeprefix("dask://").rpartition(":")
+    if text != "local" and not (text.startswith("dask://") and host and port.isdecimal() and 0 < int(port) < 1 << 16):
+        raise argparse.ArgumentTypeError(f"give local or dask://HOST:PORT, not {text}")
+    return text
+
+
 def _demo_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", metavar="DIR", type=Path, default=OUT_ROOT / "demo", help=f"folder of the results ({OUT_ROOT / 'demo'})"
@@ -138,6 +174,15 @@ COMMANDS = {
         Command("smooth", "FLIGHT", "estimate a logged flight", ESTIMATE, f"{DO}:smooth", _smooth_options, True),
         Command(
             "simulate", "SCENARIO OUT", "write a flight with known truth", ESTIMATE, f"{DO}:simulate", _simulate_options, True
+        ),
+        Command(
+            "study",
+            "[NAME]",
+            "compare estimators over many trials",
+            ESTIMATE,
+            "scenarios.studies.command:study",
+            _study_options,
+            more_options="scenarios.studies.catalogue:add_options",
         ),
         Command("check", "FLIGHT", "what a flight holds: sensors, gaps, slips, drops", LOOK, f"{DO}:check", _check_options),
         Command("report", "SOLUTION…", "write the report of a solution again", LOOK, f"{DO}:report", _report_options),
@@ -195,7 +240,7 @@ def entry() -> NoReturn:
     """The console script; an unexpected error ends with BUG, which no result code uses."""
     sys.excepthook = _report_bug
     code = main()
-    if guard.TRACE_OPTION in sys.argv:
+    if guard.TRACE_OPTION in sys.argv or guard.is_stopping():
         # while the interpreter takes itself down, another interrupt would end it by signal, and native code may crash
         sys.stderr.flush()
         os._exit(code)
@@ -234,13 +279,22 @@ def _parse(command: Command, argv: list[str]) -> argparse.Namespace:
         command.add_options(parser)
     if command.guarded:
         parser.add_argument(guard.TRACE_OPTION, type=Path, help=argparse.SUPPRESS)
+    if command.more_options:
+        known, _ = parser.parse_known_args([a for a in argv if a not in ("-h", "--help")])
+        _function(command.more_options)(parser, known)
     return parser.parse(argv)
 
 
 def _call(command: Command, args: argparse.Namespace) -> int:
-    module, _, function = command.path.partition(":")
-    code: int = getattr(import_module(module), function)(args)
+    code: int = _function(command.path)(args)
     return code
+
+
+def _function(path: str) -> Callable[..., Any]:
+    """A function by "module:function", imported now."""
+    module, _, name = path.partition(":")
+    found: Callable[..., Any] = getattr(import_module(module), name)
+    return found
 
 
 def flight_name(flight: str) -> str:

@@ -11,7 +11,7 @@ import dataclasses
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -81,13 +81,18 @@ class Stages:
         else:
             self._bar.update(self._task, description=stage, total=1.0, completed=fraction)
 
+    @property
+    def is_shown(self) -> bool:
+        """Whether there is a terminal to show progress on."""
+        return self._console.is_terminal
+
     def say(self, text: str) -> None:
         """A remark on stderr."""
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager
-def _early_end(outputs: Outputs) -> Iterator[None]:
+def early_end(outputs: Outputs) -> Iterator[None]:
     """Adds to an interrupt or a file system error what is left behind."""
     try:
         yield
@@ -106,7 +111,7 @@ def smooth(args: argparse.Namespace) -> int:
     outputs = Outputs(args.out)
     _check_replaceable(args.out / SOLUTION)
     _check_figures(args)
-    with _early_end(outputs), Stages(args.trace) as stages:
+    with early_end(outputs), Stages(args.trace) as stages:
         problem, solution = _estimate(args, stages)
         _write_results(problem, solution, outputs, stages, args)
     _print_summary(solution)
@@ -244,7 +249,7 @@ def simulate(args: argparse.Namespace) -> int:
     from scenarios.simulate.write import write_flight
 
     outputs = Outputs(args.out, unfinished=f"no complete flight is in {args.out}")
-    with _early_end(outputs), Stages(args.trace) as stages:
+    with early_end(outputs), Stages(args.trace) as stages:
         stages("simulating")
         flight = run(load_scenario(args.scenario), args.seed)
         stages("writing the flight")
@@ -278,7 +283,7 @@ def report(args: argparse.Namespace) -> int:
     for folder in args.solutions:
         outputs = Outputs(folder.parent if folder.name == SOLUTION else folder)
         check_writable(outputs.folder)
-        with _early_end(outputs), Stages() as stages:
+        with early_end(outputs), Stages() as stages:
             stages(f"reading {folder}")
             solution = solutions.load(outputs.folder / SOLUTION)
             stages("writing the report")
@@ -292,10 +297,15 @@ def report(args: argparse.Namespace) -> int:
 
 def methods(args: argparse.Namespace) -> int:
     """List the estimators."""
-    table = Table(box=None, header_style="bold")
-    for column in ("method", "what it is", "where"):
-        table.add_column(column, overflow="fold")
-    for info in registry.methods().values():
-        table.add_row(info.name, info.summary, info.path)
-    stdout_console().print(table)
+    print_catalogue("method", ((info.name, info.summary, info.path) for info in registry.methods().values()))
     return guard.DONE
+
+
+def print_catalogue(kind: str, rows: Iterable[tuple[str, str, str]]) -> None:
+    """A table of what can be chosen by name: name, summary and "module:object" of each."""
+    table = Table(box=None, header_style="bold")
+    for column in (kind, "what it is", "where"):
+        table.add_column(column, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    stdout_console().print(table)

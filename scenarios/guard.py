@@ -16,7 +16,8 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
@@ -58,8 +59,27 @@ def _interrupt_once(signum: int, frame: FrameType | None) -> NoReturn:
     # one interrupt: what follows is saving and cleaning up, which must not be interrupted again
     _stopping.set()
     for number in (signal.SIGINT, *_requests_to_end()):
-        signal.signal(number, signal.SIG_IGN)
+        signal.signal(number, _ignore)
     raise KeyboardInterrupt
+
+
+def _ignore(signum: int, frame: FrameType | None) -> None:
+    """Unlike SIG_IGN this may be set while another signal waits to be handled: Python complains of those it then finds."""
+
+
+@contextmanager
+def one_interrupt() -> Iterator[None]:
+    """For commands that are not watched: within, the first Ctrl-C, SIGTERM or SIGHUP raises KeyboardInterrupt, later ones
+    are ignored, to the end of the process. What is ignored on purpose stays so.
+    """
+    interrupts = [] if signal.getsignal(signal.SIGINT) is signal.SIG_IGN else [signal.SIGINT]
+    restore = {number: signal.signal(number, _interrupt_once) for number in (*interrupts, *_requests_to_end())}
+    try:
+        yield
+    finally:
+        for number, handler in restore.items():
+            if not _stopping.is_set():
+                signal.signal(number, handler)
 
 
 def is_stopping() -> bool:
@@ -129,11 +149,15 @@ def _interrupt(child: subprocess.Popen[bytes], at_once: bool) -> None:
         child.send_signal(signal.SIGINT)
 
 
-def _describe(code: int, trace: Path) -> str:
+def how_it_ended(code: int) -> str:
+    """What the exit code of a process that ended by itself says: the signal, or the status."""
     if -code in {s.value for s in signal.Signals}:
-        how = f"signal {-code}, {signal.Signals(-code).name}"
-    else:
-        how = f"status {code & 0xFFFFFFFF:#x}"
+        return f"signal {-code}, {signal.Signals(-code).name}"
+    return f"status {code & 0xFFFFFFFF:#x}"
+
+
+def _describe(code: int, trace: Path) -> str:
+    how = how_it_ended(code)
     if os.name == "posix" and code == -signal.SIGKILL:
         what = f"the run was killed ({how}), often because memory ran out,"
     else:

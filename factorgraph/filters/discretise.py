@@ -20,7 +20,7 @@ from numba import njit
 from factorgraph.types import Array
 
 SHORT = 0.5  # norm of F h of the step that is expanded
-TERMS = 14  # 0.5^14 / 14! is below rounding
+TERMS = 17  # terms of Q hold both sides, twice the norm: 1 / 17! is below rounding
 
 
 @njit(cache=True)

@@ -29,13 +29,14 @@ from typing import Literal
 import numpy as np
 from numba import njit
 
+from ambiguity import DoubleDifferences, follow
 from factorgraph.filters import adaptive, kalman
 from factorgraph.filters.adaptive import Statistic
 from factorgraph.filters.layout import Layout
 from factorgraph.models import double_differences as dd
 from factorgraph.models.double_differences import PairEpochs
 from factorgraph.models.robust import bifactor, igg3
-from factorgraph.types import Array, BoolArray, IntArray
+from factorgraph.types import Array, IntArray
 
 MOTION = Layout(baseline=3, velocity=3, acceleration=3)
 BASE, RATE = MOTION["baseline"], MOTION["velocity"]
@@ -101,11 +102,6 @@ class FloatSolution:
     factors: tuple[float, float]  # on the predicted motion and ambiguities; 1 unless adaptive
 
 
-def variances(sigma0: float, elevation_rad: Array) -> Array:
-    """Undifferenced variances (S,). Source: spec aar_two_stage.md, section 2.4 (at the zenith twice sigma0^2, E19)."""
-    return np.asarray(sigma0**2 * (1 + 1 / np.sin(elevation_rad) ** 2))
-
-
 @dataclass(frozen=True, slots=True)
 class _Epoch:
     """Observations of one epoch against its pivot."""
@@ -129,7 +125,7 @@ class _Epoch:
 
 
 def _epoch(data: PairEpochs, k: int, order: IntArray, r_reference: Array, settings: FloatSettings) -> _Epoch:
-    el = data.elevation_rad[k]
+    scale = data.variance_scale[k]
     return _Epoch(
         order,
         data.sat_reference[k],
@@ -137,8 +133,8 @@ def _epoch(data: PairEpochs, k: int, order: IntArray, r_reference: Array, settin
         np.zeros_like(data.sat_rover[k]),
         dd.difference(data.code_m[k], order),
         dd.difference(data.phase_m[k], order),
-        dd.covariance(variances(settings.code_m, el), order),
-        dd.covariance(variances(settings.phase_m, el), order),
+        dd.covariance(settings.code_m**2 * scale, order),
+        dd.covariance(settings.phase_m**2 * scale, order),
         data.wavelength_m,
         r_reference,
     )
@@ -154,7 +150,7 @@ def single_epoch(data: PairEpochs, k: int, r_reference: Array, settings: FloatSe
     b = b_start
     for _ in range(WLS_STEPS):
         rho, G = e.predict(b)
-        Q_b: Array = np.linalg.inv(G.T @ W @ G)
+        Q_b = np.asarray(np.linalg.inv(G.T @ W @ G))
         b = b + Q_b @ (G.T @ (W @ (e.code - rho)))
     rho, G = e.predict(b)
     # the phase adds as many unknowns as rows: it only sees the ambiguities
@@ -208,7 +204,7 @@ class FloatFilter:
         if not len(self._x) and not self._start(data, k, r_reference, ins):
             return None
         self._predict(t, disturbance)
-        self._carry(e, arc, ins)
+        self._carry(e, arc)
         out = self._update(e, ins if self.scheme.has_ins else None)
         self._order, self._arc, self._t = order, np.where(data.usable[k], arc, -1), t
         return out
@@ -235,19 +231,26 @@ class FloatFilter:
         if disturbance is not None:
             self._x[RATE] += disturbance
 
-    def _carry(self, e: _Epoch, arc: IntArray, ins: InsBaseline | None) -> None:
+    def _carry(self, e: _Epoch, arc: IntArray) -> None:
         """Express the ambiguities against this epoch's pivot; those that are new or slipped start from phase minus code."""
-        kept = np.array([s for s in self._order if arc[s] == self._arc[s]], np.int64) if len(self._order) else self._order
-        T, known = carried(self._order, kept, e.order)
-        m = len(e.order) - 1
-        M = np.zeros((N0 + m, len(self._x)))
+        old = self._order
+        slipped = old[arc[old] != self._arc[old]]
+        if len(old) and not len(slipped) and np.array_equal(old, e.order):
+            return
+        after = DoubleDifferences(int(e.order[0]), tuple(e.order[1:].tolist()))
+        if len(old):
+            before = DoubleDifferences(int(old[0]), tuple(old[1:].tolist()))
+            step = follow(before, after, slipped.tolist())
+            T, fresh = step.T, step.fresh
+        else:
+            T, fresh = np.zeros((len(after.satellites), 0), np.int64), np.ones(len(after.satellites), bool)
+        M = np.zeros((N0 + len(T), len(self._x)))
         M[CLASS_1, CLASS_1] = np.eye(N0)
         M[N0:, N0:] = T
         self._x, self._P = M @ self._x, M @ self._P @ M.T
-        if not known.all():
-            new = N0 + np.flatnonzero(~known)
-            self._x[new] = ((e.phase - e.code) / e.lam)[~known]
-            self._P[new, new] = NEW_CYC**2
+        new = N0 + np.flatnonzero(fresh)
+        self._x[new] = ((e.phase - e.code) / e.lam)[fresh]
+        self._P[new, new] = NEW_CYC**2
 
     def _update(self, e: _Epoch, ins: InsBaseline | None) -> FloatSolution:
         x_p, P_p, s = self._x, self._P, self.settings
@@ -289,29 +292,6 @@ class FloatFilter:
             for c in (CLASS_1, slice(N0, None))
         )
         return weights, (gamma_1, gamma_2)
-
-
-def carried(old: IntArray, kept: IntArray, new: IntArray) -> tuple[Array, BoolArray]:
-    """How ambiguities against one pivot become those against another.
-
-    old, new: satellites, the pivot first; kept: those of `old` whose phase is unbroken. Returns T (m_new, m_old) with
-    N_new = T N_old, and which rows are known; rows of satellites that are new or broken are zero.
-    """
-    column = {int(s): i - 1 for i, s in enumerate(old)}  # -1: the old pivot, whose own entry is zero
-    unbroken = {int(s) for s in kept}
-    T, known = np.zeros((len(new) - 1, max(len(old) - 1, 0))), np.zeros(len(new) - 1, bool)
-    pivot = int(new[0])
-    if pivot not in unbroken:
-        return T, known
-    for i, s in enumerate(new[1:].tolist()):
-        if s not in unbroken:
-            continue
-        known[i] = True
-        if column[s] >= 0:
-            T[i, column[s]] += 1.0
-        if column[pivot] >= 0:
-            T[i, column[pivot]] -= 1.0
-    return T, known
 
 
 def _two_blocks(

@@ -21,12 +21,14 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from factorgraph.attitude import exp_so3
+from factorgraph.attitude import quat_from_matrix
+from factorgraph.errors import InputError
 from factorgraph.filters.discretise import discretise, gauss_markov_density
 from factorgraph.filters.layout import Layout
 from factorgraph.geodesy import LocalFrame
 from factorgraph.measurements import ImuStream
-from factorgraph.models.strapdown import propagate
+from factorgraph.models.preintegration import sample_means
+from factorgraph.models.strapdown import gravity_into, propagate_into, quat_exp, quat_mul
 from factorgraph.types import Array
 
 INERTIAL = Layout(position=3, velocity=3, attitude=3, gyro_constant=3, gyro_markov=3, accel_markov=3)
@@ -104,12 +106,60 @@ def fill_inertial(
 
 
 @njit(cache=True)
+def _matrix(q: Array) -> Array:
+    """C (3, 3) of a unit quaternion, scalar first."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+
+
+@njit(cache=True)
+def _advance(
+    origin: Array, C_en: Array, w_ie: Array, t: Array, f: Array, w: Array, gyro: Array, accel: Array,
+    r0: Array, v0: Array, q0: Array,
+) -> tuple[Array, Array, Array, Array, Array, Array]:  # fmt: skip
+    """Position, velocity, quaternion at t[-1]; mean force in n, attitude half way, rate of the last sample."""
+    n = len(t)
+    r, v, q = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 4))
+    r[0], v[0], q[0] = r0, v0, q0
+    f, w = f - accel, w - gyro
+    propagate_into(origin, C_en, w_ie, t, f, w, r, v, q)
+    mean = np.zeros(3)
+    for i in range(1, n):
+        mean += f[i] * ((t[i] - t[i - 1]) / (t[-1] - t[0]))
+    middle = _matrix(q[n // 2])
+    return r[-1].copy(), v[-1].copy(), q[-1].copy(), middle @ mean, middle, w[-1].copy()
+
+
+@njit(cache=True)
 def _transition(
-    n: int, C_nb: Array, f_n: Array, w_ie: Array, up: Array, g_over_R: float, tau: Array, q: Array, dt: float
+    origin: Array, C_en: Array, w_ie: Array, r: Array, C_nb: Array, f_n: Array, tau: Array, q: Array, dt: float
 ) -> tuple[Array, Array]:
+    n, g = len(q), np.empty(3)
+    gravity_into(origin, C_en, r, g)
+    size = float(np.sqrt(g @ g))
+    place = origin + C_en.T @ r
     F = np.zeros((n, n))
-    fill_inertial(F, C_nb, f_n, w_ie, np.zeros(3), up, g_over_R, tau[0], tau[1])
+    fill_inertial(F, C_nb, f_n, w_ie, np.zeros(3), -g / size, size / float(np.sqrt(place @ place)), tau[0], tau[1])
     return discretise(F, np.diag(q), dt)
+
+
+@njit(cache=True)
+def _point(r: Array, v: Array, C: Array, w: Array, w_ie: Array, lever: Array) -> tuple[Array, Array]:
+    arm = C @ lever
+    return r + arm, v + C @ np.cross(w, lever) - np.cross(w_ie, arm)
+
+
+@njit(cache=True)
+def _turned(q: Array, phi: Array) -> Array:
+    """The quaternion after a small rotation phi in n."""
+    dq, out = np.empty(4), np.empty(4)
+    quat_exp(phi, dq)
+    quat_mul(dq, q, out)
+    return out / np.sqrt(out @ out)
 
 
 class Navigator:
@@ -119,16 +169,23 @@ class Navigator:
     """
 
     def __init__(self, imu: ImuStream, frame: LocalFrame, start: InertialStart, model: ImuModel, t_s: float) -> None:
-        self.frame, self.model, self.t_s = frame, model, t_s
-        self.r, self.v, self.C = start.r_n.copy(), start.v_n.copy(), start.C_nb.copy()
+        self.t_s, self.r, self.v = t_s, start.r_n.copy(), start.v_n.copy()
         self.gyro_constant, self.gyro_markov, self.accel, self.w = np.zeros((4, 3))
-        self._t, self._f, self._w = imu.t_s, imu.f_b, imu.w_b
+        self._q = quat_from_matrix(start.C_nb)
+        self._t, (_, self._f, self._w) = imu.t_s, sample_means(imu)
+        self._frame = (frame.origin_ecef, np.ascontiguousarray(frame.C_en), frame.w_ie_n)
         self._tau = np.array([model.gyro_markov_s, model.accel_markov_s])
 
-    def advance(self, t_s: float) -> tuple[Array, Array]:
-        """Propagate to t_s and return the mean specific force in n (3,) and the mean attitude (3, 3) of the way there.
+    @property
+    def C(self) -> Array:
+        """C_nb (3, 3)."""
+        matrix: Array = _matrix(self._q)
+        return matrix
 
-        The Gauss-Markov parts decay as the model says.
+    def advance(self, t_s: float) -> tuple[Array, Array]:
+        """Propagate to t_s and return the mean specific force in n (3,) and the attitude (3, 3) half way there.
+
+        The Gauss-Markov parts decay as the model says. Beyond the last sample the navigator stays at that sample.
         """
         first = int(np.searchsorted(self._t, self.t_s + 1e-9))
         last = int(np.searchsorted(self._t, t_s + 1e-9))
@@ -136,36 +193,33 @@ class Navigator:
         rows = slice(max(first - 1, 0), last)
         f, w = self._f[rows], self._w[rows]
         if t[-1] < t_s - 1e-9 and last < len(self._t):  # the sample under way covers the rest
-            t, f, w = np.append(t, t_s), np.vstack([f, self._f[last]]), np.vstack([w, self._w[last]])
-        if len(f) < len(t):
+            t, f, w = np.append(t, t_s), np.vstack([f, self._f[last : last + 1]]), np.vstack([w, self._w[last : last + 1]])
+        if len(f) < len(t):  # before the first sample: row 0 is not used
             f, w = np.vstack([f[:1], f]), np.vstack([w[:1], w])
-        r, v, C = propagate(self.frame, t, f - self.accel, w - self.gyro_constant - self.gyro_markov, self.r, self.v, self.C)
-        dt = t[-1] - t[0]
-        middle = C[len(C) // 2]
-        f_n = middle @ (np.average(f[1:], axis=0, weights=np.diff(t)) - self.accel) if dt > 0 else self.C @ f[0]
-        self.r, self.v, self.C, self.t_s = r[-1], v[-1], C[-1], float(t[-1])
-        self.w = w[-1] - self.gyro_constant - self.gyro_markov
-        decay = np.exp(-dt / self._tau)
+        if len(t) < 2:
+            raise InputError(f"the IMU has no samples from {self.t_s:.3f} to {t_s:.3f} s; filters need it at every epoch")
+        gyro = self.gyro_constant + self.gyro_markov
+        self.r, self.v, self._q, f_n, middle, self.w = _advance(*self._frame, t, f, w, gyro, self.accel, self.r, self.v, self._q)
+        decay = np.exp(-(t[-1] - t[0]) / self._tau)
         self.gyro_markov, self.accel = decay[0] * self.gyro_markov, decay[1] * self.accel
+        self.t_s = float(t[-1])
         return f_n, middle
 
     def transition(self, f_n: Array, C_nb: Array, q: Array, dt: float) -> tuple[Array, Array]:
         """Phi and Q (n, n) of the error states over dt; q (n,) densities, states beyond the 18 inertial ones are constant."""
-        g = self.frame.gravity(self.r)
-        size = float(np.linalg.norm(g))
-        from_centre = float(np.linalg.norm(self.frame.to_ecef(self.r)))
-        return _transition(len(q), C_nb, f_n, self.frame.w_ie_n, -g / size, size / from_centre, self._tau, q, dt)
+        Phi, Q = _transition(*self._frame, self.r, C_nb, f_n, self._tau, q, dt)
+        return Phi, Q
 
     def point(self, lever_b: Array) -> tuple[Array, Array]:
         """Position and velocity (3,) of a point of the body."""
-        turning = self.C @ np.cross(self.w, lever_b) - np.cross(self.frame.w_ie_n, self.C @ lever_b)
-        return self.r + self.C @ lever_b, self.v + turning
+        r, v = _point(self.r, self.v, _matrix(self._q), self.w, self._frame[2], lever_b)
+        return r, v
 
     def correct(self, dx: Array) -> None:
         """Feed the estimated errors (18,) back; they are zero afterwards."""
         self.r = self.r - dx[POS]
         self.v = self.v - dx[VEL]
-        self.C = exp_so3(dx[ATT]) @ self.C
+        self._q = _turned(self._q, dx[ATT])
         self.gyro_constant = self.gyro_constant + dx[GYRO]
         self.gyro_markov = self.gyro_markov + dx[GYRO_GM]
         self.accel = self.accel + dx[ACCEL]

@@ -121,6 +121,5 @@ def _rows_by_epoch(epoch: IntArray, usable: BoolArray, n_epochs: int) -> list[In
 def _empty(times: Array) -> TightTrack:
     n = len(times)
     r, v, antenna, antenna_v = np.zeros((4, n, 3))
-    return TightTrack(
-        times, r, v, np.zeros((n, 3, 3)), np.zeros((n, 9, 9)), np.zeros((n, 6, 6)), antenna, antenna_v, np.full(n, np.nan), np.zeros(n)
-    )
+    matrices = (np.zeros((n, 3, 3)), np.zeros((n, 9, 9)), np.zeros((n, 6, 6)))
+    return TightTrack(times, r, v, *matrices, antenna, antenna_v, np.full(n, np.nan), np.zeros(n))

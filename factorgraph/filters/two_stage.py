@@ -12,8 +12,8 @@ have in common, the reference's own error, drops out of differences.
 The main filter is a standard one (SKF) or an adaptive one (AKF), whose predicted covariance is divided by
 alpha = min(1, k0 / statistic of the innovation). While ambiguities are float, their phases are left out ("omitted"), enter
 with the ambiguities' covariance ("inflated") or as if these were known ("known"). An aided subfilter has used the predicted
-baseline, so the last two count it twice: the filter then confirms its own error. The final baseline is the least-squares one from the phases less the integers where those passed the ratio test,
-and the subfilter's own else.
+baseline, so the last two count it twice: the filter then confirms its own error. The final baseline is the least-squares
+one from the phases less the integers where those passed the ratio test, and the subfilter's own else.
 
 Source: spec aar_two_stage.md (Wu et al. 2022), sections 1, 2.2 and 2.6, errata E3, E4, E7 and E8.
 """
@@ -21,13 +21,13 @@ Source: spec aar_two_stage.md (Wu et al. 2022), sections 1, 2.2 and 2.6, errata 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from numba import njit
 
 import ambiguity
-from factorgraph.attitude import skew
 from factorgraph.errors import InputError
 from factorgraph.filters import adaptive, kalman, tightly_coupled
 from factorgraph.filters.adaptive import Statistic
@@ -38,9 +38,8 @@ from factorgraph.filters.float_ambiguity import (
     InsBaseline,
     Scheme,
     single_epoch,
-    variances,
 )
-from factorgraph.filters.inertial import ATT, INERTIAL, POS, VEL, ImuModel, InertialStart, Navigator
+from factorgraph.filters.inertial import INERTIAL, POS, ImuModel, InertialStart, Navigator
 from factorgraph.filters.tightly_coupled import TightSettings, TightTrack
 from factorgraph.models import double_differences as dd
 from factorgraph.models.double_differences import PairEpochs, pair_epochs
@@ -261,25 +260,19 @@ def _main_update(
     """Correct the navigator with code, phase and Doppler of an epoch; returns the covariance (18, 18)."""
     data, order, lam = shared.data, solution.order, shared.data.wavelength_m
     place, speed = nav.point(shared.lever_rover)
-    rho, rate, G = dd.predict(
+    predicted = dd.predict(
         data.sat_reference[k], data.sat_rover[k], data.vel_reference[k], data.vel_rover[k], order,
         r_a, shared.reference.antenna_v_n[k], place, speed,
     )  # fmt: skip
-    m = len(rho)
-    N = found.integers if fixed else solution.a_cyc
-    nu = np.concatenate([
-        dd.difference(data.code_m[k], order) - rho,
-        dd.difference(data.phase_m[k], order) - lam * N - rho,
-        dd.difference(data.rate_mps[k], order) - rate,
-    ])  # fmt: skip
-    R = main_covariance(data.elevation_rad[k], order, settings)
-    if settings.robust_main:
+    N = found.integers.astype(float) if fixed else solution.a_cyc
+    observed = (data.code_m[k], data.phase_m[k], data.rate_mps[k])
+    sigmas = (settings.floats.code_m, settings.floats.phase_m, settings.doppler_mps)
+    nu, H, R = _main_rows(order, observed, data.variance_scale[k], sigmas, predicted, lam * N, place - nav.r)
+    m = len(N)
+    if settings.robust_main and solution.weights.min() < 1.0:
         R[:m, :m] = bifactor(R[:m, :m], solution.weights)
     if not fixed and settings.float_phase == "inflated":
         R[m : 2 * m, m : 2 * m] += lam**2 * solution.Q_a
-    H = np.zeros((3 * m, INERTIAL.size))
-    H[:m, POS] = H[m : 2 * m, POS] = H[2 * m :, VEL] = -G
-    H[:m, ATT] = H[m : 2 * m, ATT] = -G @ skew(place - nav.r)
     if not fixed and settings.float_phase == "omitted":
         used = np.r_[:m, 2 * m : 3 * m]
         nu, H, R = nu[used], H[used], R[np.ix_(used, used)]
@@ -293,14 +286,31 @@ def _main_update(
     return P
 
 
-def main_covariance(elevation_rad: Array, order: IntArray, settings: TwoStageSettings) -> Array:
-    """R (3m, 3m) of code, phase and Doppler differences of one epoch."""
-    m = len(order) - 1
-    R = np.zeros((3 * m, 3 * m))
-    for i, sigma in enumerate((settings.floats.code_m, settings.floats.phase_m, settings.doppler_mps)):
-        block = slice(i * m, (i + 1) * m)
-        R[block, block] = dd.covariance(variances(sigma, elevation_rad), order)
-    return R
+@njit(cache=True)
+def _main_rows(
+    order: IntArray,
+    observed: tuple[Array, Array, Array],
+    scale: Array,
+    sigmas: tuple[float, float, float],
+    predicted: tuple[Array, Array, Array],
+    ambiguity_m: Array,
+    arm: Array,
+) -> tuple[Array, Array, Array]:
+    """Innovations (3m,), their geometry (3m, 18) and covariance (3m, 3m): code, phase, Doppler. Source: erratum E3."""
+    rho, rate, G = predicted
+    m = len(rho)
+    nu, H, R = np.empty(3 * m), np.zeros((3 * m, 18)), np.zeros((3 * m, 3 * m))
+    nu[:m] = dd.difference(observed[0], order) - rho
+    nu[m : 2 * m] = dd.difference(observed[1], order) - ambiguity_m - rho
+    nu[2 * m :] = dd.difference(observed[2], order) - rate
+    H[:m, :3] = H[m : 2 * m, :3] = H[2 * m :, 3:6] = -G
+    for i in range(m):
+        turned = -np.cross(G[i], arm)
+        H[i, 6:9] = turned
+        H[m + i, 6:9] = turned
+    for j in range(3):
+        R[j * m : (j + 1) * m, j * m : (j + 1) * m] = dd.covariance(sigmas[j] ** 2 * scale, order)
+    return nu, H, R
 
 
 def _final_baseline(
@@ -315,7 +325,7 @@ def _final_baseline(
 ) -> None:
     data, order, lam = shared.data, solution.order, shared.data.wavelength_m
     phase = dd.difference(data.phase_m[k], order)
-    R = dd.covariance(variances(settings.floats.phase_m, data.elevation_rad[k]), order)
+    R = dd.covariance(settings.floats.phase_m**2 * data.variance_scale[k], order)
     if not fixed:
         out.baseline_n[k], out.baseline_P[k] = solution.b_n, solution.Q_b
         return
@@ -334,10 +344,3 @@ def _empty_run(data: PairEpochs) -> TwoStageRun:
         data.t_rover_s, nan(3), nan(3, 3), nan(3), nan(3), nan(9, 9), nan(3, 3), np.zeros(K, bool),
         nan(), nan(), nan(), nan(), nan(), nan(),
     )  # fmt: skip
-
-
-def with_codes(shared: Shared, problem: NavigationProblem) -> Shared:
-    """The same flight with other code observations, for instance with faults; nothing else may differ."""
-    rx = receivers(problem)
-    link = problem.links[0]
-    return replace(shared, problem=problem, data=pair_epochs(rx[link.reference], rx[link.rover], problem.settings))

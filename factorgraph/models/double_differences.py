@@ -45,6 +45,7 @@ class PairEpochs:
     phase_m: Array
     rate_mps: Array
     elevation_rad: Array  # (K, S)
+    variance_scale: Array  # (K, S) 1 + 1 / sin^2 of the elevation: variance of an observation over sigma0^2
     arc: IntArray  # (K, S) changes where the integer may have, -1 without phase
     usable: BoolArray  # (K, S) code, phase and rate are there
 
@@ -57,7 +58,7 @@ class PairEpochs:
         seen = np.flatnonzero(self.usable[k])
         if not len(seen):
             return seen
-        good = seen if avoid is None else np.setdiff1d(seen, avoid)
+        good = seen if avoid is None or not len(avoid) else np.setdiff1d(seen, avoid)
         pool = good if len(good) else seen
         pivot = pool[np.argmax(self.elevation_rad[k, pool])]
         return np.concatenate([[pivot], seen[seen != pivot]])
@@ -95,6 +96,7 @@ def _tabled(reference: Receiver, rover: Receiver, pairs: PairedRows, settings: S
     code, phase, rate = (
         table(getattr(pb, name)[rb] - getattr(pa, name)[ra]) for name in ("code_m", "phase_m", "rate_mps")
     )
+    elevation = table(pb.elevation_rad[rb])
     first = np.searchsorted(k, np.arange(len(epochs)))
     vel_a, vel_b = table(pa.sat_vel_n[ra]), table(pb.sat_vel_n[rb])
     moving = np.isfinite(vel_a).all(axis=2) & np.isfinite(vel_b).all(axis=2)
@@ -110,7 +112,8 @@ def _tabled(reference: Receiver, rover: Receiver, pairs: PairedRows, settings: S
         code_m=code,
         phase_m=phase,
         rate_mps=rate,
-        elevation_rad=table(pb.elevation_rad[rb]),
+        elevation_rad=elevation,
+        variance_scale=1 + 1 / np.sin(elevation) ** 2,
         arc=arc,
         usable=np.isfinite(code) & np.isfinite(phase) & np.isfinite(rate) & (arc >= 0) & moving,
     )
@@ -181,13 +184,13 @@ def baseline_from_phase(
     Two Gauss-Newton steps: midpoint geometry makes the second one final.
     """
     b = b_start.copy()
-    N: Array = np.zeros((3, 3))
+    N = np.zeros((3, 3))
     still = np.zeros(3)
     none = np.zeros_like(sat_a)
     W = np.linalg.inv(R)
     for _ in range(3):
         rho, _rate, G = predict(sat_a, sat_b, none, none, order, r_a, still, r_a + b, still)
         GW = G.T @ W
-        N = np.linalg.inv(GW @ G)
+        N[:, :] = np.linalg.inv(GW @ G)
         b = b + N @ (GW @ (range_m - rho))
     return b, N

@@ -45,7 +45,7 @@ def _cross(a, b, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _gravity(origin, C_en, r, out):  # type: ignore[no-untyped-def]
+def gravity_into(origin, C_en, r, out):  # type: ignore[no-untyped-def]
     """Scalar twin of LocalFrame.gravity: r (3,) in n."""
     x = origin[0] + C_en[0, 0] * r[0] + C_en[1, 0] * r[1] + C_en[2, 0] * r[2]
     y = origin[1] + C_en[0, 1] * r[0] + C_en[1, 1] * r[1] + C_en[2, 1] * r[2]
@@ -61,7 +61,7 @@ def _gravity(origin, C_en, r, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _quat_exp(phi, out):  # type: ignore[no-untyped-def]
+def quat_exp(phi, out):  # type: ignore[no-untyped-def]
     a2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     if a2 < 1e-6:
         out[0] = 1 - a2 / 8 + a2 * a2 / 384
@@ -82,7 +82,7 @@ def _quat_log(q, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _quat_mul(p, q, out):  # type: ignore[no-untyped-def]
+def quat_mul(p, q, out):  # type: ignore[no-untyped-def]
     w = p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3]
     x = p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2]
     y = p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1]
@@ -124,8 +124,11 @@ def _left_jacobian(phi, J):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _propagate(origin, C_en, w_ie, t, f, w, r, v, q):  # type: ignore[no-untyped-def]
-    """Fill r, v, q from their first rows; increments of the step before row 1 are taken equal to its own."""
+def propagate_into(origin, C_en, w_ie, t, f, w, r, v, q):  # type: ignore[no-untyped-def]
+    """Fill r, v, q from their first rows; increments of the step before row 1 are taken equal to its own.
+
+    The compiled part of `propagate`: origin (3,) ECEF, C_en (3, 3), w_ie (3,), t (n,), the others (n, 3), q (n, 4).
+    """
     alpha, upsilon, alpha0, upsilon0 = np.zeros((4, 3))
     phi, u, x, a, b, g, rm, half = np.zeros((8, 3))
     J, dq, earth = np.zeros((3, 3)), np.zeros(4), np.zeros(4)
@@ -146,10 +149,10 @@ def _propagate(origin, C_en, w_ie, t, f, w, r, v, q):  # type: ignore[no-untyped
             half[k] = -w_ie[k] * dt / 2
             rm[k] = r[i - 1, k] + v[i - 1, k] * dt / 2
             alpha0[k], upsilon0[k] = alpha[k], upsilon[k]
-        _quat_exp(half, earth)
+        quat_exp(half, earth)
         _rotate(q[i - 1], u, x)
         _rotate(earth, x, x)
-        _gravity(origin, C_en, rm, g)
+        gravity_into(origin, C_en, rm, g)
         for k in range(3):
             x[k] += g[k] * dt
             b[k] = v[i - 1, k] + x[k] / 2
@@ -157,10 +160,10 @@ def _propagate(origin, C_en, w_ie, t, f, w, r, v, q):  # type: ignore[no-untyped
         for k in range(3):
             v[i, k] = v[i - 1, k] + x[k] - 2 * dt * a[k]
             r[i, k] = r[i - 1, k] + dt / 2 * (v[i - 1, k] + v[i, k])
-        _quat_mul(earth, earth, earth)
-        _quat_exp(phi, dq)
-        _quat_mul(earth, q[i - 1], q[i])
-        _quat_mul(q[i], dq, q[i])
+        quat_mul(earth, earth, earth)
+        quat_exp(phi, dq)
+        quat_mul(earth, q[i - 1], q[i])
+        quat_mul(q[i], dq, q[i])
         n = np.sqrt(q[i, 0] ** 2 + q[i, 1] ** 2 + q[i, 2] ** 2 + q[i, 3] ** 2)
         for k in range(4):
             q[i, k] /= n
@@ -168,7 +171,7 @@ def _propagate(origin, C_en, w_ie, t, f, w, r, v, q):  # type: ignore[no-untyped
 
 @njit(cache=True)
 def _invert(origin, C_en, w_ie, t, r, v, q, f, w):  # type: ignore[no-untyped-def]
-    """Fill f and w from row 1; the inverse of `_propagate`, line by line backwards."""
+    """Fill f and w from row 1; the inverse of `propagate_into`, line by line backwards."""
     alpha, upsilon, alpha0, upsilon0 = np.zeros((4, 3))
     x, a, b, g, rm, half, e, phi = np.zeros((8, 3))
     J, M, dq, back, earth = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(4), np.zeros(4), np.zeros(4)
@@ -179,11 +182,11 @@ def _invert(origin, C_en, w_ie, t, r, v, q, f, w):  # type: ignore[no-untyped-de
             e[k] = w_ie[k] * dt
             rm[k] = r[i - 1, k] + v[i - 1, k] * dt / 2
         # rotation: Exp(phi) = (Exp(-w_ie dt) C_prev)^T C
-        _quat_exp(half, earth)
+        quat_exp(half, earth)
         back[0], back[1], back[2], back[3] = q[i - 1, 0], -q[i - 1, 1], -q[i - 1, 2], -q[i - 1, 3]
-        _quat_mul(earth, earth, dq)
-        _quat_mul(back, dq, dq)
-        _quat_mul(dq, q[i], dq)
+        quat_mul(earth, earth, dq)
+        quat_mul(back, dq, dq)
+        quat_mul(dq, q[i], dq)
         _quat_log(dq, phi)
         if i == 1:
             alpha[:] = phi
@@ -194,7 +197,7 @@ def _invert(origin, C_en, w_ie, t, r, v, q, f, w):  # type: ignore[no-untyped-de
         for k in range(3):
             b[k] = v[i, k] - v[i - 1, k] + 2 * dt * a[k]
         _solve_one_plus_cross(-e, b, x)
-        _gravity(origin, C_en, rm, g)
+        gravity_into(origin, C_en, rm, g)
         for k in range(3):
             x[k] -= g[k] * dt
         _rotate(earth, x, x)
@@ -249,7 +252,7 @@ def propagate(
     r[0], v[0] = _shaped("r0_n", r0_n, (3,)), _shaped("v0_n", v0_n, (3,))
     q[0] = quat_from_matrix(_shaped("C_nb0", C_nb0, (3, 3)))
     f, w = _shaped("f_b", f_b, (n, 3)), _shaped("w_b", w_b, (n, 3))
-    _propagate(frame.origin_ecef, np.ascontiguousarray(frame.C_en), frame.w_ie_n, _shaped("t_s", t_s, (n,)), f, w, r, v, q)
+    propagate_into(frame.origin_ecef, np.ascontiguousarray(frame.C_en), frame.w_ie_n, _shaped("t_s", t_s, (n,)), f, w, r, v, q)
     return r, v, matrix_from_quat(q)
 
 

@@ -51,7 +51,7 @@ class Panel:
 
 def time_chart(title: str, panels: Sequence[Panel], note: str = "") -> Chart:
     """Panels under each other on one time axis."""
-    gap = 0.05 if len(panels) > 1 else 0.0
+    gap = min(0.05, 0.2 / len(panels)) if len(panels) > 1 else 0.0
     room = (1 - gap * (len(panels) - 1)) / sum(panel.share for panel in panels)
     layout: dict[str, Any] = {"hovermode": "x unified", "hoversubplots": "axis"}
     data, top = [], 1.0

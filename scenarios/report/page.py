@@ -1,25 +1,13 @@
-"""The report: one HTML page that holds everything it needs, text, tables, data and plotly.js.
-
-Layout of the page: headline, key figures, a navigation that stays in view, sections. plotly.js and the charts lie
-in the page as gzip in base64, which makes it three times smaller and keeps data apart from markup; `page.js`
-unpacks them with the browser's own DecompressionStream (Chromium 80, Firefox 113, Safari 16.4). A content
-security policy forbids every connection.
-"""
+"""The report of a solution: what its page says, section by section. `frame` turns it into HTML."""
 
 from __future__ import annotations
 
-import base64
-import gzip
-import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import timedelta
-from functools import lru_cache
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-from plotly.offline import get_plotlyjs, get_plotlyjs_version
 
 from factorgraph.consistency import judge, standard_deviations
 from factorgraph.solution import Fix, Solution, Status
@@ -33,66 +21,38 @@ from scenarios.metrics import (
     total_runtime_s,
 )
 from scenarios.report import quality, signals, tables, trajectory
-from scenarios.report.chart import Chart
-from scenarios.report.tables import folded, number, paragraph, text
+from scenarios.report.frame import Card, Page, Section, render_page, write_page
+from scenarios.report.tables import number, text
 
 POINT_LIMIT = 2000  # rows drawn a curve
 POINT_BUDGET = 12_000  # rows drawn in all curves of one section; many pairs share it
 MIN_POINTS = 300
-OPEN_CHARTS = 8  # charts of a section drawn at once; the rest opens on demand
-
-POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
-
-
-@dataclass(frozen=True, slots=True)
-class Section:
-    """One part of the page. Without charts and HTML it says in one line why."""
-
-    key: str
-    title: str
-    short: str  # in the navigation
-    charts: Sequence[Chart] = ()
-    html: str = ""
-    absent: str = ""
-    lead: str = ""
 
 
 def write_report(solution: Solution, path: Path) -> Path:
     """Write the report of a solution as one self-contained HTML page; folders are made. Returns the path."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(render(solution), encoding="utf-8")
-    return path
+    return write_page(solution_page(solution), path)
 
 
 def render(solution: Solution) -> str:
     """The page as text."""
+    return render_page(solution_page(solution))
+
+
+def solution_page(solution: Solution) -> Page:
+    """What the report says of a solution."""
     errors = solution_errors(solution)
-    parts = [section for section in sections(solution, errors) if section.charts or section.html or section.absent]
-    drawn = [chart for section in parts for chart in section.charts]
-    payload = json.dumps([_as_json(chart) for chart in drawn], separators=(",", ":"), allow_nan=False)
-    body, first = [], 0
-    for section in parts:
-        body.append(_section_html(section, first))
-        first += len(section.charts)
-    links = "".join(f'<a href="#{section.key}">{text(section.short)}</a>' for section in parts)
-    return "\n".join(
-        [
-            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">',
-            '<meta name="color-scheme" content="light dark">\n<link rel="icon" href="data:,">',
-            f"<title>{text(solution.name)} – relative navigation report</title>",
-            f"<style>\n{_asset('page.css')}</style>\n</head>\n<body>",
-            _headline(solution, errors),
-            f'<nav aria-label="Sections"><div>{links}</div></nav>',
-            f"<main>{''.join(body)}</main>",
-            _footer(solution),
-            '<noscript><p class="note">The plots of this page need JavaScript.</p></noscript>',
-            f'<script type="text/plain" id="packed-plotly">{_packed_plotly()}</script>',
-            f'<script type="text/plain" id="packed-charts">{_pack(payload)}</script>',
-            f"<script>\n{_asset('page.js')}</script>\n</body>\n</html>\n",
-        ]
+    about = f"{_count(len(solution.vehicles), 'vehicle')}, {_count(len(solution.pairs), 'pair')}"
+    return Page(
+        title=f"{solution.name} – relative navigation report",
+        heading=solution.name,
+        sections=sections(solution, errors),
+        cards=_cards(solution, errors),
+        badge="degraded" if solution.is_degraded else "done",
+        badge_is_good=not solution.is_degraded,
+        lines=(text(_span(solution)), f"Method <b>{text(solution.method)}</b>, {about}"),
+        reasons=_reasons(solution),
+        maker=" ".join(["relnav", solution.versions.get("relnav", "")]).strip(),
     )
 
 
@@ -238,23 +198,11 @@ def _messages(solution: Solution) -> str:
     return f'<ul class="notes">{notes}</ul>' if notes else ""
 
 
-def _headline(solution: Solution, errors: Sequence[ErrorSeries]) -> str:
+def _reasons(solution: Solution) -> list[str]:
     reasons = list(solution.diagnostics.warnings)
     if solution.diagnostics.status is not Status.CONVERGED:
         reasons.insert(0, f"The optimisation stopped early: {solution.diagnostics.status.value}.")
-    badge = '<span class="badge bad">degraded</span>' if solution.is_degraded else '<span class="badge good">done</span>'
-    listed = "".join(f"<li>{text(reason)}</li>" for reason in reasons)
-    warning = f'<ul class="reasons" aria-label="Warnings">{listed}</ul>' if reasons else ""
-    cards = "".join(
-        f'<div class="card"><span>{text(name)}</span><b>{text(value)}</b><small>{text(detail)}</small></div>'
-        for name, value, detail in _cards(solution, errors)
-    )
-    return (
-        f"<header><div><h1>{text(solution.name)}</h1>{badge}</div>"
-        f'<p class="when">{text(_span(solution))}</p><p class="when">Method <b>{text(solution.method)}</b>, '
-        f"{_count(len(solution.vehicles), 'vehicle')}, {_count(len(solution.pairs), 'pair')}</p>{warning}"
-        f'<div class="cards">{cards}</div></header>'
-    )
+    return reasons
 
 
 def _count(n: int, what: str) -> str:
@@ -276,23 +224,23 @@ def _times(solution: Solution) -> list[Array]:
     return [pair.t_s for pair in solution.pairs] + [vehicle.t_s for vehicle in solution.vehicles]
 
 
-def _cards(solution: Solution, errors: Sequence[ErrorSeries]) -> list[tuple[str, str, str]]:
-    """Key figures: name, value, detail."""
+def _cards(solution: Solution, errors: Sequence[ErrorSeries]) -> list[Card]:
+    """Key figures."""
     table, diagnostics = solution.residuals, solution.diagnostics
     runtime_s = total_runtime_s(diagnostics.runtime_s)
     epochs = max((len(t_s) for t_s in _times(solution)), default=0)
-    cards = [*_pair_cards(solution, errors), ("Epochs", f"{epochs:,}", _rate(solution))]
+    cards = [*_pair_cards(solution, errors), Card("Epochs", f"{epochs:,}", _rate(solution))]
     if len(table.t_s):
         share = f"{100 * np.mean(table.outlier):.2f} % of {len(table.t_s):,} residuals"
-        cards.append(("Outliers", f"{int(np.sum(table.outlier)):,}", share))
+        cards.append(Card("Outliers", f"{int(np.sum(table.outlier)):,}", share))
     if np.isfinite(diagnostics.nis).any():
         inside = judge(diagnostics.nis_t_s, diagnostics.nis, diagnostics.nis_dof).share_inside
-        cards.append(("NIS in 95 % band", f"{100 * inside:.1f} %", "of epochs"))
+        cards.append(Card("NIS in 95 % band", f"{100 * inside:.1f} %", "of epochs"))
     detail = f"{diagnostics.n_iterations} iterations, {diagnostics.status.value}"
-    return [*cards, ("Runtime", f"{runtime_s:.1f} s" if np.isfinite(runtime_s) else "–", detail)]
+    return [*cards, Card("Runtime", f"{runtime_s:.1f} s" if np.isfinite(runtime_s) else "–", detail)]
 
 
-def _pair_cards(solution: Solution, errors: Sequence[ErrorSeries]) -> list[tuple[str, str, str]]:
+def _pair_cards(solution: Solution, errors: Sequence[ErrorSeries]) -> list[Card]:
     pairs = [pair for pair in solution.pairs if len(pair.t_s)]
     if not pairs:
         return []
@@ -300,16 +248,16 @@ def _pair_cards(solution: Solution, errors: Sequence[ErrorSeries]) -> list[tuple
     fix = np.concatenate([pair.fix for pair in pairs])
     if np.any(fix != Fix.NONE.value):
         partial = f"and {fix_percentage(fix, Fix.PARTIAL):.1f} % partly"
-        cards.append(("Integers fixed", f"{fix_percentage(fix, Fix.FIXED):.1f} %", partial))
+        cards.append(Card("Integers fixed", f"{fix_percentage(fix, Fix.FIXED):.1f} %", partial))
     sigma = np.concatenate([standard_deviations(pair.P[:, :3, :3]) for pair in pairs])
-    cards.append(("Baseline σ", _metres(statistics(sigma).median), "median, 3D"))
+    cards.append(Card("Baseline σ", _metres(statistics(sigma).median), "median, 3D"))
     by_name = {pair_name(pair): pair for pair in pairs}
     known = [(series, by_name[series.subject]) for series in errors if series.quantity == "baseline"]
     if known:
         error = np.concatenate([series.error for series, _ in known])
         fixed = np.concatenate([series.error[pair.fix == Fix.FIXED.value] for series, pair in known])
         detail = f"{_metres(statistics(fixed).rmse)} where fixed" if len(fixed) else "against truth, 3D"
-        cards.append(("Baseline RMS error", _metres(statistics(error).rmse), detail))
+        cards.append(Card("Baseline RMS error", _metres(statistics(error).rmse), detail))
     return cards
 
 
@@ -325,51 +273,3 @@ def _metres(value: float) -> str:
     if value < 0.01:
         return f"{number(value * 1e3, 3)} mm"
     return f"{number(value * 1e2, 3)} cm" if value < 1 else f"{number(value, 3)} m"
-
-
-def _footer(solution: Solution) -> str:
-    maker = " ".join(["relnav", solution.versions.get("relnav", "")]).strip()
-    plots = f"Plots by plotly.js {get_plotlyjs_version()} (MIT licence), inside this page."
-    return f"<footer><p>{text(maker)}. {text(plots)}</p></footer>"
-
-
-def _section_html(section: Section, first: int) -> str:
-    if not section.charts and not section.html:
-        inner = paragraph(section.absent)
-    else:
-        places = [_place(chart, first + i) for i, chart in enumerate(section.charts)]
-        inner = f'<p class="note">{text(section.lead)}</p>' if section.lead else ""
-        inner += section.html
-        inner += f'<div class="charts">{"".join(places[:OPEN_CHARTS])}</div>' if places else ""
-        if places[OPEN_CHARTS:]:
-            rest = f'<div class="charts">{"".join(places[OPEN_CHARTS:])}</div>'
-            inner += folded(f"Show {len(places) - OPEN_CHARTS} more plots", rest)
-    return f'<section id="{section.key}"><h2>{text(section.title)}</h2>{inner}</section>'
-
-
-def _place(chart: Chart, index: int) -> str:
-    size = "wide" if chart.wide else "half"
-    note = paragraph(chart.note) if chart.note else ""
-    # titles are escaped for plotly and HTML alike where they are made
-    return (
-        f'<figure class="{size}"><figcaption>{chart.title}</figcaption>'
-        f'<div class="plot" data-chart="{index}" style="height:{chart.height_px}px"></div>{note}</figure>'
-    )
-
-
-def _as_json(chart: Chart) -> dict[str, object]:
-    return {"data": chart.data, "layout": chart.layout, "height": chart.height_px, "time": chart.is_time}
-
-
-def _pack(content: str) -> str:
-    return base64.b64encode(gzip.compress(content.encode(), 6, mtime=0)).decode()
-
-
-@lru_cache(maxsize=1)
-def _packed_plotly() -> str:
-    return _pack(get_plotlyjs())
-
-
-@lru_cache
-def _asset(name: str) -> str:
-    return files("scenarios.report").joinpath(name).read_text(encoding="utf-8")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from factorgraph.solution import Fix, PairSolution, ResidualTable
-from factorgraph.types import IntArray
+from factorgraph.types import Array
 from scenarios.metrics import pair_name
 from scenarios.report.chart import (
     FIX_COLOURS,
@@ -103,10 +104,16 @@ def skyplot(table: ResidualTable) -> Chart | None:
         return None
     rows = sample(SKY_ROWS, rows)
     rows = rows[np.lexsort((table.t_s[rows], table.label_index[rows]))]
-    data = []
+    tracks = []
     for mine in np.split(rows, np.flatnonzero(np.diff(table.label_index[rows])) + 1):
         path = mine[np.linspace(0, len(mine) - 1, min(SKY_POINTS, len(mine))).astype(np.int64)]
-        data.append(_sky_path(plot_text(table.label[table.label_index[mine[0]]]), table, path))
+        name = table.label[table.label_index[mine[0]]]
+        tracks.append((name, np.rad2deg(table.azimuth_rad[path]), np.rad2deg(table.elevation_rad[path])))
+    return sky_chart("Sky", tracks)
+
+
+def sky_chart(title: str, tracks: Sequence[tuple[str, Array, Array]], note: str = "") -> Chart:
+    """Paths in the sky: satellite, azimuth (n,) and elevation (n,) in degrees; the last point carries the name."""
     polar = {
         "domain": {"y": [0, 0.94]},  # leaves room between the mark of north and the legend
         "radialaxis": {"range": [90, 0], "tickvals": [0, 30, 60], "angle": 90, "tickangle": 90, "ticksuffix": "°"},
@@ -117,10 +124,11 @@ def skyplot(table: ResidualTable) -> Chart | None:
             "ticktext": ["N", "NE", "E", "SE", "S", "SW", "W", "NW"],
         },
     }
-    return Chart("Sky", legend_once(data), {"polar": polar, "hovermode": "closest"}, 460, wide=False)
+    data = [_sky_path(plot_text(name), azimuth_deg, elevation_deg) for name, azimuth_deg, elevation_deg in tracks]
+    return Chart(title, legend_once(data), {"polar": polar, "hovermode": "closest"}, 460, note, wide=False)
 
 
-def _sky_path(satellite: str, table: ResidualTable, path: IntArray) -> Trace:
+def _sky_path(satellite: str, azimuth_deg: Array, elevation_deg: Array) -> Trace:
     colour = SYSTEM_COLOURS.get(satellite[:1], TRUTH_COLOUR)
     system = SYSTEM_NAMES.get(satellite[:1], "other")
     return {
@@ -128,11 +136,11 @@ def _sky_path(satellite: str, table: ResidualTable, path: IntArray) -> Trace:
         "mode": "lines+markers+text",
         "name": system,
         "legendgroup": system,
-        "theta": numbers(np.rad2deg(table.azimuth_rad[path]), 5),
-        "r": numbers(np.rad2deg(table.elevation_rad[path]), 5),
+        "theta": numbers(azimuth_deg, 5),
+        "r": numbers(elevation_deg, 5),
         "line": {"color": colour, "width": 2},
-        "marker": {"color": colour, "size": [0] * (len(path) - 1) + [9]},
-        "text": [""] * (len(path) - 1) + [satellite],
+        "marker": {"color": colour, "size": [0] * (len(azimuth_deg) - 1) + [9]},
+        "text": [""] * (len(azimuth_deg) - 1) + [satellite],
         "textposition": "top center",
         "textfont": {"size": 11},
         "hovertemplate": f"{satellite}<br>azimuth %{{theta:.1f}}°, elevation %{{r:.1f}}°<extra></extra>",

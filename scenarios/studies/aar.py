@@ -28,7 +28,7 @@ from factorgraph.filters.two_stage import Disturbance, Shared, TwoStageRun, TwoS
 from factorgraph.types import Array, BoolArray
 from scenarios.published import aar
 from scenarios.published.aar import TANKER, UAV, AarData, AarFlight
-from scenarios.studies.aar_summary import DEFAULT, GRAPH, SWEEP, JobKey
+from scenarios.studies.aar_summary import DEFAULT, GRAPH, SWEEP, JobKey, summarise
 from scenarios.studies.study import Arrays, Job, Outcome, Results, seeds
 
 REVISION = 1  # of what a job computes; results of another one are not used again
@@ -57,9 +57,8 @@ TUNING = Tuning()
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One reading of the publication: what it changes, and where it is run."""
+    """One reading of the publication: what it changes, and where it is run. What it means is in `aar_record.VARIANTS`."""
 
-    text: str
     algorithms: tuple[str, ...] = FILTERS
     data: tuple[int, ...] = aar.DATA_SETS
     usual: int = 20  # seeds
@@ -72,24 +71,16 @@ class Variant:
 
 AIDED = ("3a", "3b", "4a", "4b", "5a", "5b")
 VARIANTS = {
-    DEFAULT: Variant("as assumed in the specification, float phases left out of the main filter", usual=50),
-    "literal-noise": Variant("0.37 m, 1 cm, 1 cm/s are undifferenced", FILTERS[:6], (1,), usual=50, noise="literal"),
-    "normalised": Variant("statistics of the adaptive factors free of units", statistic="normalised"),
-    "inflated-float": Variant(
-        "float phases in the main filter, with their covariance", FILTERS[2:], (1,), changes={"float_phase": "inflated"}
-    ),
-    "known-float": Variant(
-        "float phases in the main filter, as if known", FILTERS[2:], (1,), changes={"float_phase": "known"}
-    ),
-    "plain-main": Variant(
-        "robust weights of the codes only in the subfilter", FILTERS[6:], (2, 4), changes={"robust_main": False}
-    ),
-    "reference-jumps": Variant(
-        "the corrections of the tanker's filter count as noise", AIDED, (1, 4), changes={"reference_jumps": True}
-    ),
-    "ins-fault": Variant("5 m/s put on the INS velocity, not on the subfilter's", FILTERS[2:], (3, 4), target="ins"),
-    "start": Variant("other times of day", FILTERS[:6], (1,), starts=(1, 2, 3, 4)),
-    SWEEP: Variant("code and INS precision varied (Figures 7 and 8)", (), (1,)),
+    DEFAULT: Variant(usual=50),
+    "literal-noise": Variant(FILTERS[:6], (1,), usual=50, noise="literal"),
+    "normalised": Variant(statistic="normalised"),
+    "inflated-float": Variant(FILTERS[2:], (1,), changes={"float_phase": "inflated"}),
+    "known-float": Variant(FILTERS[2:], (1,), changes={"float_phase": "known"}),
+    "plain-main": Variant(FILTERS[6:], (2, 4), changes={"robust_main": False}),
+    "reference-jumps": Variant(AIDED, (1, 4), changes={"reference_jumps": True}),
+    "ins-fault": Variant(FILTERS[2:], (3, 4), target="ins"),
+    "start": Variant(FILTERS[:6], (1,), starts=(1, 2, 3, 4)),
+    SWEEP: Variant((), (1,)),
 }
 
 
@@ -129,9 +120,33 @@ class AarStudy:
         return fly(p["variant"], p["seed"], p["start"], p["data"], p["algorithms"])
 
     def finish(self, results: Results[Job], folder: Path, options: argparse.Namespace) -> Outcome:
-        from scenarios.studies.aar_outputs import write_outputs
+        from scenarios.report.aar import write_study
+        from scenarios.studies.aar_claims import claims
+        from scenarios.studies.aar_record import count_verdicts, write_record, write_table
 
-        return write_outputs(ByDataSet(results), folder, parameters())
+        cut, command = ByDataSet(results), _command(options)
+        summary = summarise(cut)
+        written = [
+            *write_record(summary, folder, parameters(), command),
+            *write_table(summary, folder),
+            write_study(summary, cut, folder / "report.html", parameters(), command),
+        ]
+        found = claims(summary)
+        verdicts = [f"claims of the publication: {count_verdicts(found, is_check=False)}"]
+        verdicts.append(f"acceptance checks: {count_verdicts(found, is_check=True)}")
+        return Outcome((*verdicts, f"written: {', '.join(path.name for path in written)} in {folder}"))
+
+
+def _command(options: argparse.Namespace) -> str:
+    """The command that gives these results again."""
+    words = ["relnav study aar"]
+    for name in ("trials", "data", "algorithms", "variants"):
+        value = getattr(options, name)
+        if value not in (None, list(aar.DATA_SETS), [*FILTERS, GRAPH]):
+            words.append(f"--{name} {' '.join(map(str, value)) if isinstance(value, list) else value}")
+    if options.seed != 1:
+        words.append(f"--seed {options.seed}")
+    return " ".join([*words, *(["--quick"] if options.quick else [])])
 
 
 STUDY = AarStudy()
@@ -350,11 +365,10 @@ def sweep(seed: int) -> dict[str, Any]:
     n = SWEEP_EPOCH + 1
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(7,)))
     unit = rng.normal(0.0, 1.0, (shared.data.n_epochs, 3))
-    antennas = truth.baseline_n + _tanker_truth(shared) - shared.reference.antenna_n
 
     def prior(sigma: float, bias: float = 0.0) -> list[InsBaseline]:
         shift = bias / np.sqrt(3.0)
-        return [InsBaseline(b + sigma * u + shift, sigma**2 * np.eye(3)) for b, u in zip(antennas, unit, strict=True)]
+        return [InsBaseline(b + sigma * u + shift, sigma**2 * np.eye(3)) for b, u in zip(truth.baseline_n, unit, strict=True)]
 
     def rate(scheme: Scheme, ins: list[InsBaseline] | None) -> float:
         return float(np.mean(truth.correct(two_stage.float_solutions(shared, scheme, s.floats, ins=ins)[1])))
@@ -380,12 +394,6 @@ def sweep(seed: int) -> dict[str, Any]:
         "bias_m": np.array(BIASES_M),
         "success_bias": np.array([[ekf] * len(BIASES_M), [rate(Scheme.IEKF, prior(BIASED_SIGMA_M, b)) for b in BIASES_M]]),
     }  # fmt: skip
-
-
-def _tanker_truth(shared: Shared) -> Array:
-    truth = shared.problem.vehicle(TANKER).truth
-    assert truth is not None
-    return truth.r_n
 
 
 class ByDataSet(Mapping[JobKey, Arrays]):

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import base64
-import gzip
 import json
-import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +35,7 @@ from scenarios.report import figures, page, series
 from scenarios.report.figures import write_figures
 from scenarios.report.page import write_report
 from tests.helpers import numerical_jacobian
+from tests.scenarios.pages import assert_quiet_and_drawn, charts_of, open_page
 from tests.scenarios.solution_example import example_solution, with_base
 
 HOSTILE = '</script><img src=x onerror="document.title=1"><b>&"'
@@ -269,12 +267,6 @@ CASES: dict[str, Callable[[], Solution]] = {
 }
 
 
-def _charts(text: str) -> list[dict[str, Any]]:
-    packed = text.split('id="packed-charts">')[1].split("<")[0]
-    charts: list[dict[str, Any]] = json.loads(gzip.decompress(base64.b64decode(packed)))
-    return charts
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_every_chart_fits_the_schema_of_plotly(case: str) -> None:
     solution = CASES[case]()
@@ -282,7 +274,7 @@ def test_every_chart_fits_the_schema_of_plotly(case: str) -> None:
         leader = solution.vehicles[0]
         none = {name: getattr(leader, name)[:0] for name in ("t_s", "r_n", "v_n", "q_nb", "bias_gyro", "bias_accel", "P")}
         solution = replace(solution, vehicles=(replace(leader, **none),))
-    charts = _charts(page.render(solution))
+    charts = charts_of(page.render(solution))
     assert len(charts) > (20 if case in ("whole", "many", "hostile names") else -1)
     for chart in charts:
         go.Figure({"data": chart["data"], "layout": chart["layout"]})  # raises on anything unknown
@@ -305,7 +297,7 @@ def test_text_from_input_cannot_leave_its_place() -> None:
     text = page.render(_hostile(example_solution(30)))
     assert "<img" not in text
     assert text.count("</script>") == 3
-    for chart in _charts(text):
+    for chart in charts_of(text):
         drawn = json.dumps([[t.get(k, "") for k in ("name", "hovertemplate", "text")] for t in chart["data"]])
         assert "<img" not in drawn and "</script" not in drawn
 
@@ -325,7 +317,7 @@ def test_long_solutions_stay_small_and_say_so(tmp_path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert path.stat().st_size < 5.2e6
     assert "of 100,000 epochs a curve; extremes are kept." in text
-    for chart in _charts(text):
+    for chart in charts_of(text):
         for trace in chart["data"]:
             assert len(trace.get("x", ())) <= (4200 if trace.get("fill") == "toself" else 2100)
 
@@ -355,57 +347,16 @@ def test_figure_functions_label_units_and_three_sigma() -> None:
 # Page in a browser
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    chromedriver = shutil.which("chromedriver")
-    if chromium is None or chromedriver is None:
-        pytest.skip("chromium and chromedriver are not installed: the page is not seen by a browser")
-    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed: the page is not seen by a browser")
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    flags = "headless=new no-sandbox disable-gpu no-first-run disable-background-networking disable-component-update disable-sync"
-    for flag in (*flags.split(), "window-size=1280,900", f"user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(f"--{flag}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(chromedriver))
-    yield driver
-    driver.quit()
-
-
-def _open(browser: Any, path: Path, width: int, scheme: str = "light") -> None:
-    metrics_of_screen = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 760}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics_of_screen)
-    browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": width < 760})
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]})
-    browser.get(path.as_uri())
-    deadline = time.monotonic() + 200
-    while browser.execute_script("return document.documentElement.dataset.ready") != "1":
-        assert time.monotonic() < deadline, browser.get_log("browser")
-        time.sleep(0.05)
-
-
-def _assert_quiet_and_drawn(browser: Any, n_charts: int) -> None:
-    assert browser.get_log("browser") == []
-    assert browser.execute_script("return performance.getEntriesByType('resource').length") == 0
-    drawn = browser.execute_script(
-        "return [...document.querySelectorAll('.plot')].map(d => (d.data || []).map(t => (t.x || t.r || []).length))"
-    )
-    assert len(drawn) == n_charts
-    empty = [i for i, lengths in enumerate(drawn) if not lengths or not all(lengths)]
-    assert empty == []
-
-
 def test_page_on_a_desk_draws_everything_and_runs_nothing_foreign(browser: Any, tmp_path: Path) -> None:
     solution = _hostile(example_solution(60))
     path = write_report(solution, tmp_path / "desk.html")
-    _open(browser, path, 1280)
+    open_page(browser, path, 1280)
     browser.execute_script("document.querySelectorAll('details').forEach(d => { d.open = true; })")
     deadline = time.monotonic() + 90
     while browser.execute_script("return document.querySelectorAll('.plot:not(.js-plotly-plot)').length"):
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    _assert_quiet_and_drawn(browser, len(_charts(path.read_text(encoding="utf-8"))))
+    assert_quiet_and_drawn(browser, len(charts_of(path.read_text(encoding="utf-8"))))
     assert browser.title.startswith("flight</script><img")
     assert browser.execute_script("return document.querySelector('h1').textContent") == solution.name
     assert browser.execute_script("return document.images.length") == 0
@@ -416,7 +367,7 @@ def test_page_on_a_desk_draws_everything_and_runs_nothing_foreign(browser: Any, 
 
 def test_page_on_a_phone_fits_and_legends_keep_clear(browser: Any, tmp_path: Path) -> None:
     path = write_report(example_solution(60), tmp_path / "phone.html")
-    _open(browser, path, PHONE_WIDTH, "dark")
+    open_page(browser, path, PHONE_WIDTH, "dark")
     assert browser.get_log("browser") == []
     assert browser.execute_script("return document.documentElement.scrollWidth") <= PHONE_WIDTH
     background = browser.execute_script("return getComputedStyle(document.body).backgroundColor")
@@ -441,7 +392,7 @@ def test_page_on_a_phone_fits_and_legends_keep_clear(browser: Any, tmp_path: Pat
 
 def test_zoom_in_time_moves_the_other_plots(browser: Any, tmp_path: Path) -> None:
     solution = replace(_no_pairs(example_solution(40)), residuals=ResidualTable())
-    _open(browser, write_report(solution, tmp_path / "zoom.html"), 1280)
+    open_page(browser, write_report(solution, tmp_path / "zoom.html"), 1280)
     browser.execute_script(
         "Plotly.relayout(document.querySelector('#attitude .plot'), {'xaxis.range[0]': 5, 'xaxis.range[1]': 9})"
     )
@@ -456,8 +407,8 @@ def test_zoom_in_time_moves_the_other_plots(browser: Any, tmp_path: Path) -> Non
 
 def test_bare_page_opens_without_complaint(browser: Any, tmp_path: Path) -> None:
     path = write_report(_nan_covariance(_bare(example_solution(1))), tmp_path / "bare.html")
-    _open(browser, path, PHONE_WIDTH)
-    _assert_quiet_and_drawn(browser, len(_charts(path.read_text(encoding="utf-8"))))
+    open_page(browser, path, PHONE_WIDTH)
+    assert_quiet_and_drawn(browser, len(charts_of(path.read_text(encoding="utf-8"))))
     assert browser.execute_script("return document.documentElement.scrollWidth") <= PHONE_WIDTH
 
 

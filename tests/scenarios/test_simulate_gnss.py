@@ -12,7 +12,17 @@ from factorgraph.problem import Antenna, GnssNoise
 from factorgraph.types import Array
 from scenarios.flights.navigation import builtin_constellation
 from scenarios.flights.schema import GnssNoiseTable, Origin
-from scenarios.simulate.gnss import ClockTable, EnvironmentTable, GnssRecord, GnssTable, Outage, Sky, simulate
+from scenarios.simulate.gnss import (
+    ClockTable,
+    CodeFaults,
+    EnvironmentTable,
+    GnssRecord,
+    GnssTable,
+    Outage,
+    Sky,
+    simulate,
+    with_code_faults,
+)
 from scenarios.simulate.streams import Streams
 from scenarios.simulate.trajectory import Formation, Manoeuvres, Segment, Static, Trajectory, TrajectoryTable, build
 
@@ -35,7 +45,7 @@ def paths(duration_s: float) -> dict[str, Trajectory]:
         "near": Formation(kind="formation", leader="fast", offset_m=(40.0, -60.0, 10.0), sway_m=1.0),
         "rest": Static(kind="static"),
     }
-    return build(tables, duration_s, {name: np.random.default_rng(1) for name in tables})
+    return build(tables, duration_s, {name: np.random.default_rng(1) for name in tables}, ORIGIN.frame)
 
 
 def observed(
@@ -121,6 +131,70 @@ def test_noise_follows_elevation_and_outliers_their_probability() -> None:
     assert abs(hit.mean() - 0.02) < 4 * np.sqrt(0.02 * 0.98 / n)
     assert np.all((np.abs(record.outlier_m[hit]) >= 8.0) & (np.abs(record.outlier_m[hit]) <= 30.0))
     assert 0.3 < np.mean(record.outlier_m[hit] > 0) < 0.7
+
+
+def test_flat_noise_is_the_same_at_every_elevation() -> None:
+    noise = GnssNoiseTable(code_m=0.5, phase_m=0.002, doppler_mps=0.1, elevation="flat")
+    table = GnssTable(rate_hz=5.0, noise=noise)
+    (clean, _, _), (noisy, record, _) = observed("rest", table, 120.0, 0.0), observed("rest", table, 120.0, 1.0)
+    z = (noisy.stream.code_m - clean.stream.code_m) / 0.5
+    low = record.elevation_rad < np.deg2rad(30.0)
+    for part in (z[low], z[~low]):
+        assert abs(part.std() - 1) < 4 / np.sqrt(2 * len(part))
+    assert noisy.noise.elevation == "flat"
+    np.testing.assert_array_equal(elevation_scale(record.elevation_rad, "flat"), 1.0)
+
+
+def faulty(seed: int, *faults: CodeFaults) -> tuple[Antenna, GnssRecord]:
+    table = GnssTable(signals=("G1C", "G2W"), code_faults=faults)
+    antenna, record, _ = observed("rest", table, 120.0, 1.0, seed)
+    return antenna, record
+
+
+def test_code_faults_stay_in_their_windows_and_spare_the_highest() -> None:
+    window = CodeFaults(start_s=20.0, end_s=100.0, size_m=7.0, probability=0.3)
+    hits, chances, signs = 0, 0, []
+    for seed in range(4):
+        antenna, record = faulty(seed, window)
+        s, fault = antenna.stream, record.outlier_m
+        inside = (s.t_s >= 20.0) & (s.t_s <= 100.0)
+        assert np.array_equal(np.unique(s.epoch[fault != 0]), np.flatnonzero(inside))  # every epoch, both ends included
+        assert set(np.unique(np.abs(fault))) == {0.0, 7.0}
+        for e in np.flatnonzero(inside):
+            rows = np.flatnonzero(s.epoch == e)
+            highest = s.sat[rows[np.argmax(record.elevation_rad[rows])]]
+            assert not np.any(fault[rows[s.sat[rows] == highest]])
+            of = {int(k): set(fault[rows[s.sat[rows] == k]]) for k in s.sat[rows]}
+            assert all(len(values) == 1 for values in of.values())  # both signals alike
+            hits, chances = hits + sum(values != {0.0} for values in of.values()), chances + len(of) - 1
+        signs.append(np.sign(fault[fault != 0]))
+    n = chances / (81 * 4)
+    expected = 0.3 + 0.7**n / n  # at least one
+    assert abs(hits / chances - expected) < 4 * np.sqrt(0.21 / chances) + 0.01
+    assert abs(np.mean(np.concatenate(signs))) < 0.2
+
+
+def test_code_faults_can_be_added_later_and_leave_everything_else() -> None:
+    windows = (CodeFaults(start_s=5.0, end_s=9.0, size_m=3.0), CodeFaults(start_s=50.0, end_s=50.0, size_m=9.0, probability=0.0))
+    (clean, before), (hit, record) = faulty(3), faulty(3, *windows)
+    later, same = with_code_faults(clean, before, windows, Streams(3, "/rest/gnss"))
+    np.testing.assert_array_equal(later.stream.code_m, hit.stream.code_m)
+    np.testing.assert_array_equal(same.outlier_m, record.outlier_m)
+    np.testing.assert_allclose(hit.stream.code_m - clean.stream.code_m, record.outlier_m, atol=1e-7)
+    np.testing.assert_array_equal(hit.stream.phase_cyc, clean.stream.phase_cyc)
+    assert len(np.unique(hit.stream.sat[np.abs(record.outlier_m) == 9.0])) == 1  # without any chance still one satellite
+    alone, _ = with_code_faults(clean, before, windows[1:], Streams(3, "/rest/gnss"))
+    at = clean.stream.t_s[clean.stream.epoch] == 50.0
+    np.testing.assert_array_equal(alone.stream.code_m[at], hit.stream.code_m[at])
+
+
+def test_the_sky_moves_on() -> None:
+    """Two hours later BeiDou's geostationary satellites are where they were and others are not."""
+    later = builtin_constellation().shifted_to(T0 + -7200.0, 7200.0 + 30.0)
+    names = ("C01", "C20")
+    now, then = (nav.states_at(names, np.arange(2), T0, np.zeros(2)).pos_ecef for nav in (sky(30.0).navigation, later))
+    moved = np.linalg.norm(now - then, axis=1)
+    assert moved[0] < 1e3 and moved[1] > 1e7
 
 
 def test_multipath_is_correlated_and_told_to_the_estimator() -> None:

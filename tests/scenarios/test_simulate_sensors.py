@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from factorgraph.attitude import log_so3
 from factorgraph.errors import InputError
 from factorgraph.geodesy import LocalFrame
+from factorgraph.measurements import ImuStream
 from factorgraph.models.strapdown import propagate
 from factorgraph.types import Array
 from scenarios.flights.schema import ImuNoiseTable, TagTable
 from scenarios.simulate import fixes, imu, ranging
-from scenarios.simulate.streams import Streams
+from scenarios.simulate.streams import Streams, gauss_markov
 from scenarios.simulate.trajectory import Manoeuvres, Motion, Segment, Static, Trajectory, build
 
 FRAME = LocalFrame(np.deg2rad(50.0), np.deg2rad(8.0), 300.0)
@@ -27,12 +29,16 @@ def flight(duration_s: float, turn_dps: float = 0.0) -> dict[str, Trajectory]:
     moving = Manoeuvres(kind="manoeuvres", speed_mps=25.0, segments=(Segment(duration_s=duration_s, turn_dps=turn_dps),))
     resting = Static(kind="static", r_n=(40.0, -300.0, 10.0), heading_deg=30.0)
     rng = np.random.default_rng(0)
-    return build({"a": moving, "b": resting}, duration_s, {"a": rng, "b": rng})
+    return build({"a": moving, "b": resting}, duration_s, {"a": rng, "b": rng}, FRAME)
+
+
+def sensed(table: imu.ImuTable, path: Trajectory, duration_s: float, scale: float = 1.0) -> tuple[ImuStream, imu.ImuRecord]:
+    return imu.simulate(table, imu.exact(table, path, FRAME, duration_s), STREAMS, scale)
 
 
 def navigated(table: imu.ImuTable, path: Trajectory, duration_s: float) -> tuple[Array, Array, Array, Motion]:
     """Position, velocity and attitude errors after propagation from the true start."""
-    stream, _ = imu.simulate(table, path, FRAME, duration_s, STREAMS, 1.0)
+    stream, _ = sensed(table, path, duration_s)
     true = path.at(stream.t_s)
     r, v, C = propagate(FRAME, stream.t_s, stream.f_b, stream.w_b, true.r_n[0], true.v_n[0], true.C_nb[0])
     return r - true.r_n, v - true.v_n, log_so3(C @ np.swapaxes(true.C_nb, 1, 2)), true
@@ -59,20 +65,52 @@ def test_biases_grow_as_predicted() -> None:
 def test_imu_noise_has_the_stated_densities() -> None:
     path, T = flight(100.0)["b"], 100.0
     noise = QUIET.model_copy(update={"gyro_rps_rthz": 1e-3, "accel_mps2_rthz": 2e-3})
-    clean, noisy = (imu.simulate(imu.ImuTable(noise=n), path, FRAME, T, STREAMS, 1.0)[0] for n in (QUIET, noise))
+    clean, noisy = (sensed(imu.ImuTable(noise=n), path, T)[0] for n in (QUIET, noise))
     np.testing.assert_allclose((noisy.w_b - clean.w_b).std(axis=0), 1e-3 * np.sqrt(200.0), rtol=0.03)
     np.testing.assert_allclose((noisy.f_b - clean.f_b).std(axis=0), 2e-3 * np.sqrt(200.0), rtol=0.03)
     walking = QUIET.model_copy(update={"gyro_bias_walk_rps_rts": 1e-4})
-    _, record = imu.simulate(imu.ImuTable(noise=walking), path, FRAME, T, STREAMS, 1.0)
+    _, record = sensed(imu.ImuTable(noise=walking), path, T)
     np.testing.assert_allclose(np.diff(record.gyro_bias_rps, axis=0).std(axis=0), 1e-4 * np.sqrt(0.005), rtol=0.03)
+
+
+BIASED = ImuNoiseTable(gyro_rps_rthz=1e-12, accel_mps2_rthz=1e-12, gyro_bias_deg_h=5.0, accel_bias_mg=2.0)
+
+
+def test_gauss_markov_biases_have_their_size_and_correlation() -> None:
+    """Spec common.md, section 4: steady standard deviation from the first sample, exp(-dt / tau) from one to the next."""
+    T, tau = 2000.0, 5.0
+    table = imu.ImuTable(
+        rate_hz=20.0, noise=BIASED, gyro_gm_deg_h=3.0, gyro_gm_s=tau, accel_gm_mg=0.5, accel_gm_s=tau, accel_bias_mps2=(0, 0, 0)
+    )
+    _, record = sensed(table, flight(T)["b"], T)
+    expected = (3.0 * np.pi / 180 / 3600, 0.5 * 9.80665e-3)
+    effective = 3 * T / (2 * tau)  # independent samples
+    for bias, sigma in zip((record.gyro_bias_rps, record.accel_bias_mps2), expected, strict=True):
+        x = (bias - bias.mean(axis=0)) / sigma
+        assert abs(np.mean(x * x) - 1) < 5 * np.sqrt(2 / effective)
+        for lag_s in (1.0, 5.0):
+            k = round(lag_s * 20)
+            assert abs(np.mean(x[k:] * x[:-k]) - np.exp(-lag_s / tau)) < 5 / np.sqrt(effective)
+    assert np.max(np.abs(record.accel_bias_mps2.mean(axis=0))) < 5 * expected[1] * np.sqrt(2 * tau / T)
+    starts = np.array([gauss_markov(np.random.default_rng(k).normal(size=2), 0.3) for k in range(4000)])
+    np.testing.assert_allclose(starts.var(axis=0), 1.0, atol=5 * np.sqrt(2 / 4000))
+    np.testing.assert_allclose(np.mean(starts[:, 0] * starts[:, 1]), np.exp(-0.3), atol=5 / np.sqrt(4000))
+
+
+def test_a_gauss_markov_bias_is_told_as_the_walk_of_its_driving_noise() -> None:
+    told = imu.ImuTable(noise=BIASED, gyro_gm_deg_h=3.0, gyro_gm_s=200.0).told.noise
+    np.testing.assert_allclose(told.gyro_bias_walk_rps_rts, np.sqrt(2 * (3.0 / 3600 * np.pi / 180) ** 2 / 200.0), rtol=1e-12)
+    np.testing.assert_allclose(told.gyro_bias_rps, 5.0 / 3600 * np.pi / 180, rtol=1e-12)
+    assert told.accel_bias_walk_mps2_rts == BIASED.noise.accel_bias_walk_mps2_rts
+    walking = BIASED.model_copy(update={"gyro_bias_walk_deg_h_rts": 1.0})
+    with pytest.raises(ValidationError, match=r"gyro_gm_deg_h and noise.gyro_bias_walk_deg_h_rts exclude each other"):
+        imu.ImuTable(noise=walking, gyro_gm_deg_h=3.0)
 
 
 def test_scale_factors_multiply_the_motion() -> None:
     path = flight(10.0, 10.0)["a"]
-    exact, _ = imu.simulate(imu.ImuTable(noise=QUIET), path, FRAME, 10.0, STREAMS, 1.0)
-    scaled, record = imu.simulate(
-        imu.ImuTable(noise=QUIET, gyro_scale_ppm=500, accel_scale_ppm=800), path, FRAME, 10.0, STREAMS, 1.0
-    )
+    exact, _ = sensed(imu.ImuTable(noise=QUIET), path, 10.0)
+    scaled, record = sensed(imu.ImuTable(noise=QUIET, gyro_scale_ppm=500, accel_scale_ppm=800), path, 10.0)
     assert np.all(record.gyro_scale != 0) and np.max(np.abs(record.accel_scale)) < 800e-6 * 5
     np.testing.assert_allclose(scaled.w_b, exact.w_b * (1 + record.gyro_scale), atol=1e-9)
     np.testing.assert_allclose(scaled.f_b, exact.f_b * (1 + record.accel_scale), atol=1e-9)
@@ -80,7 +118,7 @@ def test_scale_factors_multiply_the_motion() -> None:
 
 def test_imu_at_rest_feels_gravity_and_earth_rate() -> None:
     path = flight(5.0)["b"]
-    stream, _ = imu.simulate(imu.ImuTable(), path, FRAME, 5.0, STREAMS, 0.0)
+    stream, _ = sensed(imu.ImuTable(), path, 5.0, 0.0)
     true = path.at(stream.t_s)
     np.testing.assert_allclose(stream.f_b, -FRAME.gravity(true.r_n) @ true.C_nb[0], atol=1e-9)
     np.testing.assert_allclose(stream.w_b - FRAME.w_ie_n @ true.C_nb[0], 0.0, atol=1e-11)

@@ -7,12 +7,17 @@ import pytest
 
 from factorgraph.attitude import euler_from_matrix, log_so3
 from factorgraph.errors import InputError
+from factorgraph.geodesy import LocalFrame, geodetic_from_ecef
 from scenarios.simulate.trajectory import (
     STANDARD_GRAVITY,
     Formation,
+    Kinematic,
+    KinematicTrajectory,
     Manoeuvres,
     OffsetAt,
+    Rates,
     Segment,
+    SplineTrajectory,
     Static,
     Trajectory,
     TrajectoryTable,
@@ -21,6 +26,7 @@ from scenarios.simulate.trajectory import (
     build,
 )
 
+FRAME = LocalFrame(np.deg2rad(52.0), np.deg2rad(9.0), 100.0)
 TURNS = Manoeuvres(
     kind="manoeuvres",
     start_n=(10.0, 20.0, 100.0),
@@ -35,9 +41,23 @@ TURNS = Manoeuvres(
     ),
 )
 
+PLACE = {"lat_deg": 52.3, "lon_deg": 9.4, "h_m": 3000.0, "speed_mps": 60.0}
+AEROBATICS = Kinematic(
+    kind="kinematic",
+    **PLACE,
+    heading_deg=170.0,
+    pitch_deg=3.0,
+    roll_deg=-8.0,
+    segments=(
+        Rates(duration_s=20.0, roll_dps=0.5),
+        Rates(duration_s=30.0, yaw_dps=3.0, accel_mps2=0.2),
+        Rates(duration_s=40.0, pitch_dps=-0.4, roll_dps=1.0),
+    ),
+)
+
 
 def built(**tables: TrajectoryTable) -> dict[str, Trajectory]:
-    return build(dict(tables), 90.0, {name: np.random.default_rng(3) for name in tables})
+    return build(dict(tables), 90.0, {name: np.random.default_rng(3) for name in tables}, FRAME)
 
 
 def test_derivatives_are_continuous_and_agree_with_the_motion() -> None:
@@ -48,7 +68,8 @@ def test_derivatives_are_continuous_and_agree_with_the_motion() -> None:
         np.testing.assert_allclose((after.r_n - before.r_n) / (2 * h), here.v_n, atol=1e-6)
         rate = log_so3(np.swapaxes(before.C_nb, 1, 2) @ after.C_nb) / (2 * h)
         np.testing.assert_allclose(rate, here.w_nb_b, atol=1e-6)
-        for spline in (path.position, path.euler):
+        assert isinstance(path, SplineTrajectory)
+        for spline in (path.position, path.angles):
             for order in range(5):  # splines of degree 5 on simple knots jump in the fifth derivative only
                 step = spline(t + 1e-9, order) - spline(t - 1e-9, order)
                 assert np.max(np.abs(step)) < 1e-5 * (1 + np.max(np.abs(spline(t, order + 1 if order < 4 else 4))))
@@ -84,7 +105,7 @@ def test_a_follower_holds_its_offsets_in_the_track_frame() -> None:
     assert list(paths) == ["b", "a"]
     for t, offset in ((5.0, offsets[0]), (80.0, offsets[1])):
         leader, follower = paths["a"].at(np.array([t])), paths["b"].at(np.array([t]))
-        psi = paths["a"].euler(t)[2]
+        psi = paths["a"].euler(np.array([t]))[0, 2]
         right, front = np.array([np.cos(psi), -np.sin(psi), 0.0]), np.array([np.sin(psi), np.cos(psi), 0.0])
         d = (follower.r_n - leader.r_n)[0]
         np.testing.assert_allclose((d @ right, d @ front, d[2]), offset.offset_m, atol=1e-3)
@@ -97,6 +118,48 @@ def test_waypoints_are_passed_at_their_times() -> None:
     path = built(a=Waypoints(kind="waypoints", points=points))["a"]
     for p in points:
         np.testing.assert_allclose(path.at(np.array([p.t_s])).r_n[0], p.r_n, atol=1e-6)
+
+
+def test_kinematic_flight_follows_its_table_over_the_ellipsoid() -> None:
+    """Position against a fine midpoint integration of the geodetic rates, angles against the local level."""
+    path = built(a=AEROBATICS)["a"]
+    t = np.linspace(0.0, 90.0, 9001)
+    speed = np.interp(t, [0, 20, 50, 90], [60, 60, 66, 66])
+    pitch, roll, heading = (
+        np.deg2rad(np.interp(t, [0, 20, 50, 90], x)) for x in ([3, 3, 3, -13], [-8, 2, 2, 42], [170, 170, 260, 260])
+    )
+    motion = path.at(t)
+    C_ln = FRAME.C_to_enu(motion.r_n)
+    for got, want in zip(euler_from_matrix(C_ln @ motion.C_nb), (pitch, roll, heading), strict=True):
+        np.testing.assert_allclose(np.exp(1j * got), np.exp(1j * want), atol=1e-12)
+    v = np.einsum("nij,nj->ni", C_ln, motion.v_n)
+    level = speed * np.cos(pitch)
+    want = np.column_stack([level * np.sin(heading), level * np.cos(heading), speed * np.sin(pitch)])
+    np.testing.assert_allclose(v, want, atol=1e-9)
+    start = geodetic_from_ecef(FRAME.to_ecef(motion.r_n[0]))
+    np.testing.assert_allclose(start, (np.deg2rad(52.3), np.deg2rad(9.4), 3000.0), rtol=1e-12)
+    moved = np.cumsum(np.vstack([np.zeros(3), 0.005 * (motion.v_n[1:] + motion.v_n[:-1])]), axis=0)  # trapezoids
+    np.testing.assert_allclose(motion.r_n - motion.r_n[0], moved, atol=2e-3)
+
+
+def test_kinematic_rates_and_velocities_are_derivatives_also_around_the_ends() -> None:
+    path = built(a=AEROBATICS)["a"]
+    assert isinstance(path, KinematicTrajectory)
+    t, h = np.arange(-1.95, 91.9, 0.1), 1e-3
+    before, here, after = path.at(t - h), path.at(t), path.at(t + h)
+    np.testing.assert_allclose((after.r_n - before.r_n) / (2 * h), here.v_n, atol=1e-5)
+    rate = log_so3(np.swapaxes(before.C_nb, 1, 2) @ after.C_nb) / (2 * h)
+    np.testing.assert_allclose(rate, here.w_nb_b, atol=1e-7)
+    angles = path.euler(t)
+    np.testing.assert_allclose(np.exp(1j * angles), np.exp(1j * np.column_stack(euler_from_matrix(here.C_nb))), atol=1e-12)
+    assert np.max(np.abs(np.diff(angles[:, 2]))) < 0.01
+
+
+def test_a_follower_holds_its_place_beside_kinematic_flight() -> None:
+    paths = built(b=Formation(kind="formation", leader="a", frame="body", offset_m=(5.0, -20.0, 1.0)), a=AEROBATICS)
+    leader, follower = (paths[name].at(np.arange(5.0, 15.0)) for name in ("a", "b"))
+    at = np.einsum("nji,nj->ni", leader.C_nb, follower.r_n - leader.r_n)
+    np.testing.assert_allclose(at, np.tile((5.0, -20.0, 1.0), (10, 1)), atol=1e-6)
 
 
 def test_rest_and_standstill_keep_the_heading() -> None:
@@ -116,6 +179,8 @@ def test_rest_and_standstill_keep_the_heading() -> None:
         (Waypoints(kind="waypoints", points=(Waypoint(t_s=0, r_n=(0, 0, 0)), Waypoint(t_s=50, r_n=(9, 9, 9)))), "span 0 to 50 s"),
         (Waypoints(kind="waypoints", points=tuple(Waypoint(t_s=t, r_n=(t, 0, 0)) for t in (0, 50, 50, 90))), "must increase"),
         (Manoeuvres(kind="manoeuvres", segments=(Segment(duration_s=9.0),)), "repeat = true"),
+        (Kinematic(kind="kinematic", **PLACE, segments=(Rates(duration_s=9.0),)), "its segments last 9 of 90 s"),
+        (Kinematic(kind="kinematic", **PLACE, segments=(Rates(duration_s=90.0, accel_mps2=-1.0),)), "slow it down"),
         (Manoeuvres(kind="manoeuvres", speed_mps=5, segments=(Segment(duration_s=90.0, accel_mps2=-1),)), "slow it down"),
     ],
 )

@@ -113,7 +113,7 @@ def trial(scenario: str, method: str, duration_s: float | None, seed: int) -> Tr
         nees=nees(error, pair.P[:, :3, :3]),
         bound_m2=np.trace(bound[:, :3, :3], axis1=1, axis2=2),
         fix=pair.fix,
-        wrong_epochs=wrong_epochs(flight, solution),
+        wrong_epochs=len(wrong_times(flight, solution)),
         status=solution.diagnostics.status.value,
         runtime_s=sum(solution.diagnostics.runtime_s.values()),
     )
@@ -124,8 +124,8 @@ def replace_duration(description: Scenario, duration_s: float) -> Scenario:
     return description.model_copy(update={"scenario": description.scenario.model_copy(update={"duration_s": duration_s})})
 
 
-def wrong_epochs(flight: SimulatedFlight, solution: Solution) -> int:
-    """Epochs of the first pair at which some integer in use differs from the simulated one.
+def wrong_times(flight: SimulatedFlight, solution: Solution) -> set[int]:
+    """Times [s] of the first pair's epochs at which some integer in use differs from the simulated one.
 
     Integers are determined up to one common shift per signal, so each epoch's deviations of a signal must all be equal.
     """
@@ -155,4 +155,4 @@ def wrong_epochs(flight: SimulatedFlight, solution: Solution) -> int:
                     deviations.add(int(table.integer[i]) - (number[pair.rover][key_b] - number[pair.reference][key_a]))
             if len(deviations) > 1:
                 wrong.add(int(t))
-    return len(wrong)
+    return wrong

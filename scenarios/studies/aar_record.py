@@ -1,0 +1,359 @@
+"""The refuelling study on paper: its tables, a Markdown page with claims and parameters, results as JSON, CSV and Parquet.
+
+Everything is made of the summary alone, so a page can be made again from the JSON file, and says then the same.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from scenarios.solutions import replace_with
+from scenarios.studies.aar_claims import DATA_SETS, PAPER_RATIO, PAPER_SUCCESS, Claim, Verdict, claims, plain, shown
+from scenarios.studies.aar_summary import (
+    ALGORITHMS,
+    DEFAULT,
+    GRAPH,
+    RATIO_CAP,
+    SCHEMES,
+    SWEEP,
+    Cell,
+    Row,
+    Summary,
+    algorithm_name,
+    from_json,
+    json_text,
+    metric_of,
+    to_json,
+)
+from scenarios.writers import write_csv, write_parquet
+
+JSON_NAME, PAGE_NAME = "aar.json", "aar.md"
+VARIANTS = {
+    DEFAULT: "main set",
+    "literal-noise": "0.37 m, 1 cm and 1 cm/s read as deviations of undifferenced observations",
+    "normalised": "normalised statistics of the adaptive factor and the state classes",
+    "inflated-float": "float phases in the main filter, with their covariance",
+    "known-float": "float phases in the main filter, as if known",
+    "plain-main": "robust weights of the codes only in the subfilter",
+    "reference-jumps": "the corrections of the tanker's filter count as noise",
+    "ins-fault": "velocity fault put into the INS instead of the subfilter's prediction",
+    "start": "other start times, hence other satellites",
+    SWEEP: "code and INS precision varied",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Plain texts; the first `n_text` columns are words, the others numbers."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+    n_text: int = 1
+
+
+def tables(summary: Summary) -> list[Table]:
+    """All tables that have rows, in reading order."""
+    found = [
+        _paper_table(summary, "Success rate P_SE [%]", "p_se", PAPER_SUCCESS, ".1f", "Table 2"),
+        _paper_table(summary, "Mean ratio", "ratio_mean", PAPER_RATIO, ".2f", "Figure 12"),
+        *(_rates(summary, data) for data in DATA_SETS),
+        *(_errors(summary, data) for data in DATA_SETS),
+        *(_faults(summary, data) for data in DATA_SETS),
+        _manoeuvres(summary),
+        _pairs(summary),
+        _variants(summary),
+        _starts(summary),
+    ]
+    return [table for table in found if table.rows]
+
+
+def _paper_table(
+    summary: Summary, title: str, metric: str, paper: Mapping[str, Mapping[int, float]], form: str, source: str
+) -> Table:
+    rows = []
+    for digit in (*SCHEMES, GRAPH):
+        cells = []
+        for data in DATA_SETS:
+            algorithm = GRAPH if digit == GRAPH else summary.scheme(digit, data)
+            published = paper.get(digit, {}).get(data)
+            cells.append(shown(summary.statistic(metric, algorithm, data), "", form))
+            cells.append("–" if published is None else plain(published, form))
+        if any(cell != "–" for cell in cells[::2]):
+            rows.append((SCHEMES.get(digit, "factor graph"), *cells))
+    head = ("scheme", *(name for data in DATA_SETS for name in (f"Data {data}", "paper")))
+    note = f"Mean over the seeds with its 95 % interval beside {source} of the paper; schemes with the adaptive main filter."
+    return Table(title, head, tuple(rows), note)
+
+
+Column = tuple[str, str, str, float]  # head, metric, format, scale
+
+
+def _by_algorithm(
+    summary: Summary, title: str, data: int, columns: Sequence[Column], note: str = "", extra: bool = False
+) -> Table:
+    """A row for each algorithm on a data set; with `extra` a last column tells whether its covariance is consistent."""
+    rows = []
+    for row in summary.rows:
+        if (row.cell.variant, row.cell.data, row.cell.start) != (DEFAULT, data, 0):
+            continue
+        cells = [shown(row.statistics.get(metric), "", form, scale) for _, metric, form, scale in columns]
+        if any(cell != "–" for cell in cells):
+            rows.append((algorithm_name(row.cell.algorithm), *cells, *([_consistency(row)] if extra else [])))
+    head = ("algorithm", *(column[0] for column in columns), *(["mean NEES in 99 % band [%]"] if extra else []))
+    return Table(f"{title}, Data {data}", head, tuple(rows), note)
+
+
+def _consistency(row: Row) -> str:
+    mark = "" if row.is_consistent else " ‡"
+    return f"{plain(row.nees_consistent)}{mark}"
+
+
+def _rates(summary: Summary, data: int) -> Table:
+    columns = (
+        ("P_corr [%]", "p_corr", ".1f", 1.0),
+        ("P_fix [%]", "p_fix", ".1f", 1.0),
+        ("P_SE [%]", "p_se", ".1f", 1.0),
+        ("wrong of the fixed [%]", "wrong_fix", ".2f", 1.0),
+        ("ratio, mean", "ratio_mean", ".2f", 1.0),
+        ("ratio, median", "ratio_median", ".2f", 1.0),
+        ("ADOP, mean [cycles]", "adop_mean", ".3f", 1.0),
+    )
+    note = f"A ratio beyond {RATIO_CAP:.0f} counts as {RATIO_CAP:.0f} in its mean; epochs without a ratio are left out."
+    return _by_algorithm(summary, "Ambiguities", data, columns, note)
+
+
+def _errors(summary: Summary, data: int) -> Table:
+    columns = (
+        ("baseline RMS [m]", "baseline_rms", ".3g", 1.0),
+        ("mean [m]", "baseline_mean", ".3g", 1.0),
+        ("largest [m]", "baseline_max", ".3g", 1.0),
+        ("fixed, RMS [cm]", "baseline_rms_fixed", ".3g", 100.0),
+        ("fixed, largest [m]", "baseline_max_fixed", ".3g", 1.0),
+        ("main filter RMS [m]", "main_rms", ".3g", 1.0),
+        ("velocity RMS [cm/s]", "velocity_rms", ".3g", 100.0),
+        ("largest [m/s]", "velocity_max", ".3g", 1.0),
+        ("NEES, mean", "nees_mean", ".3g", 1.0),
+        ("runtime [s]", "runtime", ".2g", 1.0),
+    )
+    note = "Norms of three components. ‡ covariance not consistent: mean NEES in its band at less than 90 % of the epochs."
+    return _by_algorithm(summary, "Errors", data, columns, note, extra=True)
+
+
+def _faults(summary: Summary, data: int) -> Table:
+    columns = (
+        ("ratio, median", "fault_ratio_median", ".2f", 1.0),
+        ("P_SE inside [%]", "fault_p_se", ".1f", 1.0),
+        ("P_SE outside [%]", "clear_p_se", ".1f", 1.0),
+        ("baseline RMS inside [m]", "fault_baseline_rms", ".3g", 1.0),
+        ("largest inside [m]", "fault_baseline_max", ".3g", 1.0),
+        ("velocity, largest inside [m/s]", "fault_velocity_max", ".3g", 1.0),
+    )
+    return _by_algorithm(summary, "Fault windows", data, columns)
+
+
+def _manoeuvres(summary: Summary) -> Table:
+    columns = (
+        *((f"{at} s", f"velocity_manoeuvre@{at}", ".3g", 100.0) for at in (20, 65, 180, 300)),
+        ("all four", "velocity_manoeuvre", ".3g", 100.0),
+        ("elsewhere", "velocity_elsewhere", ".3g", 100.0),
+    )
+    return _by_algorithm(summary, "Velocity RMS within 5 s of the manoeuvre changes [cm/s]", 1, columns)
+
+
+def _name(cell: Cell) -> str:
+    return algorithm_name(cell.algorithm)
+
+
+def _pairs(summary: Summary) -> Table:
+    """Paired differences on the main set."""
+    rows = []
+    for d in summary.differences:
+        if d.metric not in ("p_se", "ratio_mean", "baseline_rms", "velocity_rms", "fault_p_se") or d.second.variant != DEFAULT:
+            continue
+        where = f"Data {d.first.data}" if d.first.data == d.second.data else f"Data {d.first.data} and {d.second.data}"
+        meaning, n = metric_of(d.metric), d.difference.n
+        title = f"{meaning.title}{f' [{meaning.unit}]' if meaning.unit else ''}"
+        wins = f"{d.better} / {d.worse} / {n - d.better - d.worse}"
+        rows.append((where, title, _name(d.first), _name(d.second), shown(d.difference), shown(d.percent), wins))
+    head = ("data", "quantity", "first", "second", "second less first", "in percent", "seeds better / worse / even")
+    return Table("Paired differences", head, tuple(rows), "Both methods of a pair saw the same noise.", 4)
+
+
+def _variants(summary: Summary) -> Table:
+    rows = []
+    for row in summary.rows:
+        if row.cell.variant in (DEFAULT, "start"):
+            continue
+        values = [
+            shown(row.statistics.get(m), "", form) for m, form in (("p_se", ".1f"), ("ratio_mean", ".2f"), ("wrong_fix", ".2f"))
+        ]
+        values += [shown(row.statistics.get(m)) for m in ("baseline_rms", "velocity_rms", "velocity_max")]
+        default = shown(summary.statistic("p_se", row.cell.algorithm, row.cell.data), "", ".1f")
+        rows.append((row.cell.variant, f"Data {row.cell.data}", _name(row.cell), default, *values, str(len(row.seeds))))
+    head = (
+        "variant", "data", "algorithm", "P_SE of the main set [%]", "P_SE [%]", "ratio, mean", "wrong of the fixed [%]",
+        "baseline RMS [m]", "velocity RMS [m/s]", "velocity, largest [m/s]", "seeds",
+    )  # fmt: skip
+    used = dict.fromkeys(row[0] for row in rows)
+    note = "; ".join(f"{name}: {VARIANTS.get(name, name)}" for name in used)
+    return Table("Variants", head, tuple(rows), f"{note}." if note else "", 3)
+
+
+def _starts(summary: Summary) -> Table:
+    """P_SE on Data 1 by start time, the main set as start 0."""
+    starts = {row.cell.start: row.cell.variant for row in summary.rows if row.cell.variant == "start" and row.cell.data == 1}
+    if not starts:
+        return Table("Start times", (), ())
+    columns = [(0, DEFAULT), *((start, variant) for start, variant in sorted(starts.items()) if start)]
+    rows = []
+    for algorithm in ALGORITHMS:
+        cells = [shown(summary.statistic("p_se", algorithm, 1, variant, start), "", ".1f") for start, variant in columns]
+        if any(cell != "–" for cell in cells[1:]):
+            rows.append((algorithm_name(algorithm), *cells))
+    head = ("algorithm", *(f"start {start}" for start, _ in columns))
+    return Table("P_SE on Data 1 by start time [%]", head, tuple(rows), "Start 0 is that of the main set.")
+
+
+# Markdown
+
+
+def count_verdicts(found: Sequence[Claim], is_check: bool) -> str:
+    """How many claims have which verdict, in words."""
+    mine = [claim for claim in found if claim.is_check == is_check]
+    counts = {verdict: [claim for claim in mine if claim.verdict is verdict] for verdict in Verdict}
+    return ", ".join(f"{len(group)} {group[0].word}" for group in counts.values() if group) or "none"
+
+
+def record_content(summary: Summary, parameters: Mapping[str, object], command: str) -> dict[str, Any]:
+    """What the JSON file holds."""
+    judged = [[c.id, c.text, c.paper, c.ours, c.word, c.evidence] for c in claims(summary)]
+    about = {"study": "aar", "command": command, "parameters": {name: _text(value) for name, value in parameters.items()}}
+    return about | {"claims": judged} | to_json(summary)
+
+
+def _text(value: object) -> str:
+    return (
+        ", ".join(_text(v) for v in value)
+        if isinstance(value, list | tuple)
+        else f"{value:g}"
+        if isinstance(value, float)
+        else str(value)
+    )
+
+
+def markdown(content: Mapping[str, Any]) -> str:
+    """The page of a record's content."""
+    summary = from_json(content)
+    judged = claims(summary)
+    parts = [
+        "# Aerial refuelling: the study\n",
+        "What the publication on two-stage adaptive GNSS/INS relative navigation for aerial refuelling reports, and what "
+        "`relnav study aar` finds. Numbers are means over the seeds with 95 % bootstrap intervals; differences are paired.\n",
+        f"Made by\n\n```\n{content['command']}\n```\n",
+        _runs(summary),
+        f"Claims of the publication: {count_verdicts(judged, False)}. Acceptance checks: {count_verdicts(judged, True)}.\n",
+        "## Claims\n",
+        _markdown_table(_claim_table([c for c in judged if not c.is_check], "publication")),
+        "## Acceptance checks\n",
+        _markdown_table(_claim_table([c for c in judged if c.is_check], "")),
+    ]
+    for table in tables(summary):
+        parts += [f"## {table.title}\n", _markdown_table(table)] + ([f"{table.note}\n"] if table.note else [])
+    parts += _curves(summary)
+    rows = tuple(content["parameters"].items())
+    parts += ["## Parameters\n", _markdown_table(Table("", ("parameter", "value"), rows, n_text=2))] if rows else []
+    return "\n".join(parts)
+
+
+def _runs(summary: Summary) -> str:
+    rows = []
+    for variant in dict.fromkeys(row.cell.variant for row in summary.rows):
+        mine = [row for row in summary.rows if row.cell.variant == variant]
+        data = ", ".join(str(d) for d in sorted({row.cell.data for row in mine}))
+        starts = ", ".join(str(s) for s in sorted({row.cell.start for row in mine}))
+        n = sorted({len(row.seeds) for row in mine})
+        seeds = str(n[0]) if len(n) == 1 else f"{n[0]} to {n[-1]}"
+        rows.append((variant, VARIANTS.get(variant, ""), data, starts, seeds))
+    if summary.curves:
+        rows.append((SWEEP, VARIANTS[SWEEP], "1", "0", str(max(curve.n for curve in summary.curves))))
+    return _markdown_table(Table("", ("variant", "what", "Data", "start", "seeds"), tuple(rows), n_text=4))
+
+
+def _claim_table(found: Sequence[Claim], source: str) -> Table:
+    if source:
+        rows = tuple((c.text, c.paper, c.ours, c.word, c.evidence) for c in found)
+        return Table("", ("claim", source, "here", "verdict", "evidence"), rows, n_text=5)
+    return Table(
+        "", ("check", "here", "verdict", "evidence"), tuple((c.text, c.ours, c.word, c.evidence) for c in found), n_text=4
+    )
+
+
+def _curves(summary: Summary) -> list[str]:
+    titles = {
+        "adop_code": ("ADOP against the code σ [cycles]", ".3g"),
+        "adop_ins": ("ADOP against the σ of the INS position [cycles]", ".3g"),
+        "success_ins": ("P_corr against the σ of the INS position [%]", ".1f"),
+        "success_bias": ("P_corr against a bias of the INS position [%]", ".1f"),
+    }
+    parts = []
+    for curve in summary.curves:
+        if curve.name not in titles:
+            continue
+        title, form = titles[curve.name]
+        rows = tuple((plain(x), *(plain(row[j], form) for row in curve.mean)) for j, x in enumerate(curve.x))
+        parts += [f"## {title}\n", _markdown_table(Table("", (curve.x_title, *curve.labels), rows))]
+    return parts
+
+
+def _markdown_table(table: Table) -> str:
+    marks = ["---" if i < table.n_text else "--:" for i in range(len(table.head))]
+    lines = [table.head, marks, *table.rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+
+
+# files
+
+
+def write_record(summary: Summary, folder: Path, parameters: Mapping[str, object], command: str) -> list[Path]:
+    """Write the JSON file and the Markdown page of the study. Raises InputError naming what cannot be written."""
+    content = record_content(summary, parameters, command)
+    return [_write(folder / JSON_NAME, json_text(content)), _write(folder / PAGE_NAME, markdown(content))]
+
+
+def page_of(path: Path) -> str:
+    """The Markdown page that belongs to a JSON file of `write_record`."""
+    return markdown(json.loads(path.read_text(encoding="utf-8")))
+
+
+def write_table(summary: Summary, folder: Path, stem: str = "results") -> list[Path]:
+    """Write every statistic as one long table, CSV and Parquet: a row for each cell and metric."""
+    names = ("variant", "data", "start", "algorithm", "metric", "unit", "mean", "lower", "upper", "smallest", "largest", "seeds")
+    columns = zip(*_long_rows(summary), strict=True) if summary.rows else [()] * len(names)
+    table = pa.table(dict(zip(names, (list(column) for column in columns), strict=True)))
+    written = []
+    writers: tuple[tuple[str, Callable[[pa.Table, Path], None]], ...] = (("csv", write_csv), ("parquet", write_parquet))
+    for kind, write in writers:
+        written.append(folder / f"{stem}.{kind}")
+        write(table, written[-1])
+    return written
+
+
+def _long_rows(summary: Summary) -> Iterator[tuple[object, ...]]:
+    for row in summary.rows:
+        cell = row.cell
+        for name, s in row.statistics.items():
+            values = (s.value, s.lower, s.upper, s.low, s.high, s.n)
+            yield cell.variant, cell.data, cell.start, cell.algorithm, name, metric_of(name).unit, *values
+
+
+def _write(path: Path, content: str) -> Path:
+    replace_with(path, lambda part: part.write_text(content, encoding="utf-8"))
+    return path
