@@ -71,7 +71,7 @@ def float_solution(A: ArrayLike, B: ArrayLike, y: ArrayLike, Q_y: ArrayLike) -> 
     try:
         U, D, order = factorise(Q_y)
     except ValueError:
-        raise ValueError("Q_y must be positive definite (an observation given twice?)") from None
+        raise ValueError("Q_y must be positive definite (an ambiguity or observation given twice?)") from None
     whitened = np.linalg.solve(U, np.column_stack([design, y])[order]) / np.sqrt(D)[:, None]
     scale = np.linalg.norm(whitened[:, :columns], axis=0)
     if columns > y.size or np.any(scale == 0):
