@@ -40,13 +40,13 @@ $(INSTALLED): pyproject.toml requirements.lock | $(BIN)/python
 	@touch $@
 
 $(TESTABLE): $(INSTALLED)
-	$(BIN)/python -m pip install --quiet -c requirements.lock -e ".[figures,test]"
+	$(BIN)/python -m pip install --quiet -c requirements.lock -e ".[cluster,figures,test]"
 	@touch $@
 
 lock:
 	rm -rf $(VENV)-lock
 	$(PYTHON) -m venv $(VENV)-lock
-	$(VENV)-lock/bin/python -m pip install --quiet -e ".[figures,test]"
+	$(VENV)-lock/bin/python -m pip install --quiet -e ".[cluster,figures,test]"
 	$(VENV)-lock/bin/python -m pip install --quiet --no-deps cssrlib
 	{ echo "# The tested versions; make uses them as constraints. Renew with: make lock"; \
 	  $(VENV)-lock/bin/python -m pip freeze --exclude-editable --all | grep -v '^pip=='; } > requirements.lock

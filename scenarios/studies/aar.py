@@ -42,14 +42,13 @@ class Tuning:
     """What is tuned: on data set 1 where the publication is silent, then kept for all."""
 
     accel_walk: float = 1.0  # m/s^2 per sqrt(s)
-    ambiguity_walk: float = 1.5  # cycles per sqrt(s): the EKF's success rate on data set 1 is then the published 88 %
+    ambiguity_walk: float = 1.5  # cycles per sqrt(s): the EKF's success rate on data set 1, seeds 1001 to 1010, is then 89 %
     k0: float = 1.5
     c0: float = 1.5
     c1: float = 4.5
     c2: float = 2.0
     ratio_threshold: float = 3.0
-    tanker_code_m: float = 30.0
-    tanker_doppler_mps: float = 0.005
+    tanker_code_m: float = 30.0  # loose: what its filter corrects in position, the UAV's filter takes for motion
 
 
 TUNING = Tuning()
@@ -198,7 +197,7 @@ def prepare(seed: int, start: int, noise: aar.Noise) -> Prepared:
 
 def _share(flight: AarFlight, problem: Any, tanker: TightTrack | None) -> Shared:
     models = dict.fromkeys((TANKER, UAV), aar.imu_model())
-    tight = TightSettings(TUNING.tanker_code_m, TUNING.tanker_doppler_mps)
+    tight = TightSettings(TUNING.tanker_code_m, settings(flight.noise, "1a").doppler_mps)
     return two_stage.share(problem, flight.start, models, tanker, tight)
 
 
