@@ -6,14 +6,10 @@ an installed package adds its own through the entry-point group `relnav.methods`
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
-from dataclasses import dataclass
-from importlib import import_module
-from importlib.metadata import entry_points
 from typing import Protocol
 
-from factorgraph.errors import InputError
+from factorgraph.named import Named, Names
 from factorgraph.problem import NavigationProblem
 from factorgraph.solution import Solution
 
@@ -28,33 +24,19 @@ class Method(Protocol):
     def solve(self, problem: NavigationProblem, progress: Progress) -> Solution: ...
 
 
-@dataclass(frozen=True, slots=True)
-class MethodInfo:
-    name: str
-    path: str  # "package.module:Class"
-    summary: str
+METHODS = Names(
+    "method", "relnav.methods", (Named("graph", "factorgraph.graphs.batch:Batch", "GTSAM factor graph over the whole flight"),)
+)
 
 
-BUILT_IN = (MethodInfo("graph", "factorgraph.graphs.batch:Batch", "GTSAM factor graph over the whole flight"),)
-
-
-def methods() -> dict[str, MethodInfo]:
+def methods() -> dict[str, Named]:
     """All methods, ours first."""
-    found = {m.name: m for m in BUILT_IN}
-    for entry in entry_points(group="relnav.methods"):
-        found.setdefault(entry.name, MethodInfo(entry.name, entry.value, f"from {entry.dist.name if entry.dist else '?'}"))
-    return found
+    return METHODS.all()
 
 
 def create(name: str) -> Method:
-    """An estimator by name. Raises InputError with the nearest names for an unknown one."""
-    known = methods()
-    if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        raise InputError(f"no method named {name}{hint} There are: {', '.join(known)}")
-    module, _, attribute = known[name].path.partition(":")
-    method: Method = getattr(import_module(module), attribute)()
+    """An estimator by name. Raises InputError with the nearest name for an unknown one."""
+    method: Method = METHODS.create(name)
     return method
 
 

@@ -38,6 +38,23 @@ def wheel_file(package: str, relative: str) -> Path:
     return path
 
 
+def install_entry_points(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, group: str, module: str, names: Sequence[str]
+) -> None:
+    """Makes classes of a module known under their names in lower case as those of an installed package `plugins`.
+
+    For this process and for those it starts.
+    """
+    place = folder / "site"
+    info = place / "plugins-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plugins\nVersion: 1.0\n", encoding="utf-8")
+    entries = [f"{name.lower()} = {module}:{name}" for name in names]
+    (info / "entry_points.txt").write_text(f"[{group}]\n" + "\n".join(entries) + "\n", encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(place), str(ROOT)]))
+    monkeypatch.syspath_prepend(str(place))
+
+
 def interruptible(command: Sequence[str]) -> list[str]:
     """The command, started so that it hears Ctrl-C even where the tests themselves run with SIGINT ignored."""
     start = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execvp(sys.argv[1], sys.argv[1:])"

@@ -2,7 +2,7 @@
 
     predict      P <- Phi P Phi' + Q
     update       S = H P H' + R,  K = P H' inv(S),  x <- x + K nu,  P <- (I - K H) P (I - K H)' + K R K'   (Joseph)
-    sequential   the same, rows whitened by the Cholesky factor of R and taken one at a time
+    sequential   the same, rows whitened by the Cholesky factor of R and taken one at a time, zeros skipped
 
 The form of Joseph keeps P symmetric and positive semi-definite for any gain, also one that an adaptive or robust factor
 changed. Rows with infinite variance do not occur here: leave them out.
@@ -19,10 +19,27 @@ from factorgraph.types import Array
 
 
 @njit(cache=True)
+def _product(A: Array, B: Array) -> Array:
+    """A (l, m) times B (m, n), quick where A is mostly zero as transitions are."""
+    out = np.zeros((A.shape[0], B.shape[1]))
+    for i in range(A.shape[0]):
+        for k in range(A.shape[1]):
+            c = A[i, k]
+            if c != 0.0:
+                for j in range(B.shape[1]):
+                    out[i, j] += c * B[k, j]
+    return out
+
+
+@njit(cache=True)
 def predict(P: Array, Phi: Array, Q: Array) -> Array:
     """Covariance (n, n) after a time step, symmetric to the last digit."""
-    out = Phi @ P @ Phi.T + Q
-    return 0.5 * (out + out.T)
+    out = _product(Phi, _product(Phi, P).T.copy())
+    for i in range(len(P)):
+        for j in range(i + 1):
+            out[i, j] = 0.5 * ((out[i, j] + Q[i, j]) + (out[j, i] + Q[j, i]))
+            out[j, i] = out[i, j]
+    return out
 
 
 @njit(cache=True)
@@ -49,21 +66,29 @@ def update(P: Array, nu: Array, H: Array, R: Array) -> tuple[Array, Array, float
 
 @njit(cache=True)
 def whiten(nu: Array, H: Array, R: Array) -> tuple[Array, Array]:
-    """inv(L) nu and inv(L) H with R = L L': rows of unit, independent noise."""
+    """inv(L) nu and inv(L) H with R = L L': rows of unit, independent noise.
+
+    Raises LinAlgError where R is not positive definite.
+    """
     m, n = H.shape
-    L = np.linalg.cholesky(R)
-    y, W = nu.copy(), H.copy()
+    U, y, W = R.copy(), nu.copy(), H.copy()  # eliminating with rows of U = L' is the forward substitution, too
     for i in range(m):
-        for j in range(i):
-            c = L[i, j]
-            if c != 0.0:
-                y[i] -= c * y[j]
-                for k in range(n):
-                    W[i, k] -= c * W[j, k]
-        d = 1.0 / L[i, i]
+        if not U[i, i] > 0.0:
+            raise np.linalg.LinAlgError("the covariance of the measurements is not positive definite")
+        d = 1.0 / np.sqrt(U[i, i])
         y[i] *= d
         for k in range(n):
             W[i, k] *= d
+        for k in range(i, m):
+            U[i, k] *= d
+        for j in range(i + 1, m):
+            c = U[i, j]
+            if c != 0.0:
+                y[j] -= c * y[i]
+                for k in range(n):
+                    W[j, k] -= c * W[i, k]
+                for k in range(j, m):
+                    U[j, k] -= c * U[i, k]
     return y, W
 
 
@@ -74,33 +99,37 @@ def scalar_updates(P: Array, y: Array, W: Array) -> tuple[Array, float]:
     Returns the correction (n,) and the normalised innovation squared.
     """
     n = P.shape[0]
-    dx, ph, K, aph = np.zeros(n), np.empty(n), np.empty(n), np.empty(n)
+    dx, ph, K, d = np.zeros(n), np.empty(n), np.empty(n), np.empty(n)
+    seen = np.empty(n, np.int64)  # states that a row observes, mostly few
     nis = 0.0
     for i in range(len(y)):
-        h = W[i]
+        h, count = W[i], 0
         s, nu = 1.0, y[i]
+        ph[:] = 0.0
         for j in range(n):
-            total = 0.0
-            for k in range(n):
-                total += P[j, k] * h[k]
-            ph[j] = total
-            s += h[j] * total
-            nu -= h[j] * dx[j]
+            c = h[j]
+            if c != 0.0:
+                seen[count] = j
+                count += 1
+                nu -= c * dx[j]
+                for k in range(n):
+                    ph[k] += P[j, k] * c
+        for j in seen[:count]:
+            s += h[j] * ph[j]
         nis += nu * nu / s
         for j in range(n):
             K[j] = ph[j] / s
             dx[j] += K[j] * nu
-        for j in range(n):  # A P with A = I - K h'
+            d[j] = K[j]
+        for q in seen[:count]:  # d = K - A P h with A P = P - K ph', rounded as it is below: that is what Joseph's form repairs
+            c, g = h[q], ph[q]
+            for j in range(n):
+                d[j] -= (P[q, j] - K[j] * g) * c
+        for j in range(n):  # (A P) A' + K K' = A P + d K', filled symmetrically
+            a, b = K[j], d[j]
             for k in range(n):
-                P[j, k] -= K[j] * ph[k]
-        for j in range(n):
-            total = 0.0
-            for k in range(n):
-                total += P[j, k] * h[k]
-            aph[j] = total
-        for j in range(n):  # (A P) A' + K K', filled symmetrically
-            for k in range(j + 1):
-                P[j, k] += K[k] * (K[j] - aph[j])
+                P[j, k] = P[j, k] - a * ph[k] + b * K[k]
+            for k in range(j):
                 P[k, j] = P[j, k]
     return dx, nis
 

@@ -3,45 +3,25 @@
 from __future__ import annotations
 
 import argparse
-import difflib
-from dataclasses import dataclass
-from importlib import import_module
-from importlib.metadata import entry_points
 
-from factorgraph.errors import InputError
+from factorgraph.named import Named, Names
 from scenarios.studies.study import Study
 
-GROUP = "relnav.studies"
+STUDIES = Names(
+    "study",
+    "relnav.studies",
+    (Named("aar", "scenarios.studies.aar:STUDY", "two-stage relative navigation for aerial refuelling, as published"),),
+)
 
 
-@dataclass(frozen=True, slots=True)
-class StudyInfo:
-    name: str
-    path: str  # "package.module:CLASS_OR_INSTANCE"
-    summary: str
-
-
-BUILT_IN = (StudyInfo("aar", "scenarios.studies.aar:STUDY", "two-stage relative navigation for aerial refuelling, as published"),)
-
-
-def studies() -> dict[str, StudyInfo]:
+def studies() -> dict[str, Named]:
     """All studies, ours first; none is imported."""
-    found = {s.name: s for s in BUILT_IN}
-    for entry in entry_points(group=GROUP):
-        found.setdefault(entry.name, StudyInfo(entry.name, entry.value, f"from {entry.dist.name if entry.dist else '?'}"))
-    return found
+    return STUDIES.all()
 
 
 def create(name: str) -> Study:
     """A study by name. Raises InputError with the nearest name for an unknown one."""
-    known = studies()
-    if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"; did you mean {near[0]}?" if near else "."
-        raise InputError(f"no study named {name}{hint} There are: {', '.join(known)}")
-    module, _, attribute = known[name].path.partition(":")
-    found = getattr(import_module(module), attribute)
-    study: Study = found() if isinstance(found, type) else found
+    study: Study = STUDIES.create(name)
     return study
 
 

@@ -20,7 +20,7 @@ from factorgraph.solution import Solution
 from scenarios import cli, demo, guard, solutions
 from scenarios.metrics import summary_rows
 from scenarios.overrides import override
-from tests.helpers import ROOT, interruptible
+from tests.helpers import ROOT, install_entry_points, interruptible
 from tests.scenarios.solution_example import example_solution
 
 SCENARIO = """
@@ -56,14 +56,7 @@ def flight(tmp_path: Path) -> Path:
 @pytest.fixture
 def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Installs the estimators of `plugin_methods` under their names in lower case, for child processes too."""
-    place = tmp_path / "site"
-    info = place / "plugins-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plugins\nVersion: 1.0\n", encoding="utf-8")
-    entries = [f"{name.lower()} = tests.scenarios.plugin_methods:{name}" for name in METHODS]
-    (info / "entry_points.txt").write_text("[relnav.methods]\n" + "\n".join(entries) + "\n", encoding="utf-8")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(place), str(ROOT)]))
-    monkeypatch.syspath_prepend(str(place))
+    install_entry_points(tmp_path, monkeypatch, "relnav.methods", "tests.scenarios.plugin_methods", METHODS)
 
 
 @pytest.fixture

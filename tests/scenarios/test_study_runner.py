@@ -19,13 +19,14 @@ import numpy as np
 import pytest
 
 from factorgraph.errors import InputError
+from factorgraph.named import Named
 from scenarios import cli, guard
 from scenarios.studies import catalogue, engines, store
 from scenarios.studies.engines import Done, Failed, Replies, Task, execute
 from scenarios.studies.runner import Tally, run
 from scenarios.studies.store import State, Store
 from scenarios.studies.study import Job, Outcome, Results, seeds
-from tests.helpers import ROOT, interruptible
+from tests.helpers import install_entry_points, interruptible
 from tests.scenarios import plugin_studies
 from tests.scenarios.plugin_studies import Hopeless, Misnamed, Stumbling, Sums, Twins
 
@@ -55,14 +56,7 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Installs the studies of `plugin_studies` under their names in lower case, for child processes too."""
-    place = tmp_path / "site"
-    info = place / "plugins-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plugins\nVersion: 1.0\n", encoding="utf-8")
-    entries = [f"{name.lower()} = tests.scenarios.plugin_studies:{name}" for name in STUDIES]
-    (info / "entry_points.txt").write_text(f"[{catalogue.GROUP}]\n" + "\n".join(entries) + "\n", encoding="utf-8")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(place), str(ROOT)]))
-    monkeypatch.syspath_prepend(str(place))
+    install_entry_points(tmp_path, monkeypatch, catalogue.STUDIES.group, "tests.scenarios.plugin_studies", STUDIES)
     monkeypatch.chdir(tmp_path)
 
 
@@ -312,11 +306,11 @@ def test_without_a_name_all_studies_are_listed(capsys: pytest.CaptureFixture[str
     assert relnav() == guard.DONE
     out = capsys.readouterr().out
     assert all(name in out for name in ("sums", "stumbling", "from plugins"))
-    assert all(info.name in out for info in catalogue.BUILT_IN)
+    assert all(info.name in out for info in catalogue.STUDIES.built_in)
 
 
-@pytest.mark.parametrize("info", catalogue.BUILT_IN, ids=lambda info: info.name)
-def test_our_studies_are_as_listed(info: catalogue.StudyInfo) -> None:
+@pytest.mark.parametrize("info", catalogue.STUDIES.built_in, ids=lambda info: info.name)
+def test_our_studies_are_as_listed(info: Named) -> None:
     study = catalogue.create(info.name)
     assert (study.name, study.summary) == (info.name, info.summary)
     study.add_options(argparse.ArgumentParser())
