@@ -194,8 +194,8 @@ class FloatFilter:
         if self.scheme.has_ins and ins is None:
             raise ValueError(f"{self.scheme.value} needs the baseline of the INS")
         arc = data.arc[k]
-        broken = np.flatnonzero((arc != self._arc) & (self._arc >= 0)) if len(self._arc) else None
-        order = data.order(k, avoid=broken)
+        unknown = np.flatnonzero(arc != self._arc) if len(self._arc) else None  # broken or new: a pivot that resets all others
+        order = data.order(k, avoid=unknown)
         t = float(data.t_rover_s[k])
         if len(order) < 4:
             self._predict(t, disturbance)
@@ -262,19 +262,17 @@ class FloatFilter:
         x, P = _two_blocks(x_p, P_p, G, e.lam, nu_code, nu_phase, nu_ins, e.R_code, e.R_phase, ins)
         weights, gammas = np.ones(len(nu_code)), (1.0, 1.0)
         for _ in range(s.passes if self.scheme.is_robust else 0):
-            weights, gammas_now = self._factors(x, P, P_p, e, G, nu_code)
-            if weights.min() == 1.0 and min(gammas_now) == 1.0:
+            found = self._factors(x, P, P_p, e, G, nu_code)
+            if found[0].min() == 1.0 and min(found[1]) == 1.0:
                 break
-            gammas = gammas_now
+            weights, gammas = found
             R = bifactor(e.R_code, weights)
             P_bar = adaptive.classified(P_p, [(CLASS_1, gammas[0]), (slice(N0, None), gammas[1])])
             x, P = _two_blocks(x_p, P_bar, G, e.lam, nu_code, nu_phase, nu_ins, R, e.R_phase, ins)
         self._x, self._P = x, P
         return FloatSolution(e.order, x[N0:], P[N0:, N0:], x[BASE], P[BASE, BASE], P[BASE, N0:], weights, gammas)
 
-    def _factors(
-        self, x: Array, P: Array, P_p: Array, e: _Epoch, G: Array, nu_code: Array
-    ) -> tuple[Array, tuple[float, float]]:
+    def _factors(self, x: Array, P: Array, P_p: Array, e: _Epoch, G: Array, nu_code: Array) -> tuple[Array, tuple[float, float]]:
         """Factors on the codes' weights (m,) and on the two classes of the predicted state."""
         s, x_p = self.settings, self._x
         d = x - x_p

@@ -84,10 +84,13 @@ def run(
             f_n, middle = nav.advance(float(t))
             Phi, Q = nav.transition(f_n, middle, q, dt)
             Phi[CLOCK, DRIFT] = dt
-            P = kalman.predict(P, Phi, Q)
             clock += drift * dt
+        else:
+            Phi, Q = np.eye(STATES.size), np.zeros((STATES.size, STATES.size))
         rows = rows_of[k]
-        if len(rows):
+        if not len(rows):
+            P = kalman.predict(P, Phi, Q)
+        else:
             place, speed = nav.point(lever)
             e = prepared.sat_n[rows] - place
             rho = np.linalg.norm(e, axis=1)
@@ -102,11 +105,10 @@ def run(
             H[m:, VEL], H[m:, DRIFT] = e, 1.0
             scale = np.sqrt(1 + 1 / np.sin(prepared.elevation_rad[rows]) ** 2)
             sigma = np.concatenate([settings.code_m * scale, settings.doppler_mps * scale])
-            track.jump[k] = P[:6, :6]
-            dx, nis = kalman.scalar_updates(P, nu / sigma, H / sigma[:, None])
+            dx, P, nis, prior = kalman.step(P, Phi, Q, nu, H, np.diag(sigma**2))
             nav.correct(dx)
             clock, drift = clock + dx[CLOCK], drift + dx[DRIFT]
-            track.jump[k] -= P[:6, :6]
+            track.jump[k] = prior[:6, :6] - P[:6, :6]
             track.nis[k], track.n_rows[k] = nis, 2 * m
         track.r_n[k], track.v_n[k], track.C_nb[k], track.P[k] = nav.r, nav.v, nav.C, P[:9, :9]
         track.antenna_n[k], track.antenna_v_n[k] = nav.point(lever)

@@ -144,7 +144,7 @@ def share(
     data = pair_epochs(ref, rov, problem.settings)
     if reference is None:
         reference = tightly_coupled.run(ref, problem.frame, start[link.reference], models[link.reference], tight)
-    rows = np.clip(np.searchsorted(reference.t_s, data.t_reference_s - 1e-9), 0, len(reference.t_s) - 1)
+    rows = np.clip(np.searchsorted(reference.t_s, data.t_reference_s - 1e-6), 0, len(reference.t_s) - 1)
     if np.any(np.abs(reference.t_s[rows] - data.t_reference_s) > 1e-6):
         raise InputError(f"vehicle {link.reference}: its solution does not cover the epochs it shares with {link.rover}")
     at = TightTrack(*(np.asarray(getattr(reference, name))[rows] for name in TightTrack.__slots__))

@@ -93,9 +93,7 @@ def _tabled(reference: Receiver, rover: Receiver, pairs: PairedRows, settings: S
 
     arc = np.full((len(epochs), len(seen)), -1, np.int64)
     arc[k, s] = arcs.of_row
-    code, phase, rate = (
-        table(getattr(pb, name)[rb] - getattr(pa, name)[ra]) for name in ("code_m", "phase_m", "rate_mps")
-    )
+    code, phase, rate = (table(getattr(pb, name)[rb] - getattr(pa, name)[ra]) for name in ("code_m", "phase_m", "rate_mps"))
     elevation = table(pb.elevation_rad[rb])
     first = np.searchsorted(k, np.arange(len(epochs)))
     vel_a, vel_b = table(pa.sat_vel_n[ra]), table(pb.sat_vel_n[rb])
