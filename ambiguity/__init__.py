@@ -1,10 +1,10 @@
 """Integer ambiguity resolution: estimators, validation, success rates, and the bookkeeping of double differences.
 
-    decorrelation, search      integer least squares, exact; `batch` for many epochs at once
-    bootstrapping, equivariant other integer estimators
-    partial, constrained       fixing a subset; known positions and baseline lengths
-    validation, simulation     tests of the best candidate, their thresholds, success rates
-    states                     satellites that come, go and slip, and a pivot that changes
+decorrelation, search      integer least squares, exact; `batch` for many epochs at once
+bootstrapping, equivariant other integer estimators
+partial, constrained       fixing a subset; known positions and baseline lengths
+validation, simulation     tests of the best candidate, their thresholds, success rates
+states                     satellites that come, go and slip, and a pivot that changes
 """
 
 from ambiguity.batch import (

@@ -38,9 +38,7 @@ def wheel_file(package: str, relative: str) -> Path:
     return path
 
 
-def install_entry_points(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, group: str, module: str, names: Sequence[str]
-) -> None:
+def install_entry_points(folder: Path, monkeypatch: pytest.MonkeyPatch, group: str, module: str, names: Sequence[str]) -> None:
     """Makes classes of a module known under their names in lower case as those of an installed package `plugins`.
 
     For this process and for those it starts.

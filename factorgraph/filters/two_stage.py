@@ -28,6 +28,7 @@ import numpy as np
 from numba import njit
 
 import ambiguity
+from factorgraph.attitude import skew
 from factorgraph.errors import InputError
 from factorgraph.filters import adaptive, kalman, tightly_coupled
 from factorgraph.filters.adaptive import Statistic
@@ -39,7 +40,7 @@ from factorgraph.filters.float_ambiguity import (
     Scheme,
     single_epoch,
 )
-from factorgraph.filters.inertial import INERTIAL, POS, ImuModel, InertialStart, Navigator
+from factorgraph.filters.inertial import ATT, INERTIAL, POS, ImuModel, InertialStart, Navigator
 from factorgraph.filters.tightly_coupled import TightSettings, TightTrack
 from factorgraph.models import double_differences as dd
 from factorgraph.models.double_differences import PairEpochs, pair_epochs
@@ -223,7 +224,7 @@ def run(
             fault = None
         r_a = shared.reference.antenna_n[k]
         place, _ = nav.point(shared.lever_rover)
-        R_ins = P[POS, POS]
+        R_ins = _antenna_covariance(P, place - nav.r)
         out.ins_sigma_m[k] = np.sqrt(np.trace(R_ins))
         if floats is not None:
             solution, found = floats[0][k], floats[1][k]
@@ -243,6 +244,13 @@ def run(
         out.resolved.append(found)
         out.floats.append(solution)
     return out
+
+
+def _antenna_covariance(P: Array, arm: Array) -> Array:
+    """Covariance (3, 3) of the antenna's position, from that of position and attitude; arm (3,) in n."""
+    J = np.hstack([np.eye(3), skew(arm)])
+    states = np.r_[POS, ATT]
+    return np.asarray(J @ P[np.ix_(states, states)] @ J.T)
 
 
 def _main_update(

@@ -74,6 +74,9 @@ def pair_epochs(reference: Receiver, rover: Receiver, settings: Settings) -> Pai
     if len(pairs.group_names) > 1:
         signals = ", ".join(pairs.group_names)
         raise InputError(f"link {names}: this filter takes one signal, both share {signals}; choose with systems and bands")
+    lam = b.wavelength_m[pairs.b]
+    if np.ptp(lam) > 1e-9:
+        raise InputError(f"link {names}: this filter takes satellites of one carrier, not GLONASS; choose with systems")
     return _tabled(reference, rover, pairs, settings)
 
 

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from factorgraph.attitude import exp_so3, log_so3, matrix_from_euler
 from factorgraph.errors import InputError
 from factorgraph.geodesy import LocalFrame
-from factorgraph.models.strapdown import _gravity, ideal_imu, propagate
+from factorgraph.models.strapdown import gravity_into, ideal_imu, propagate
 from factorgraph.types import Array
 
 FRAME = LocalFrame(np.deg2rad(55.0), np.deg2rad(37.0), 200.0)
@@ -40,7 +40,7 @@ def test_gravity_twin_is_the_frames_gravity() -> None:
     r = np.random.default_rng(1).uniform(-1, 1, (20, 3)) * [3e4, 3e4, 5e3]
     out = np.zeros((20, 3))
     for i in range(20):
-        _gravity(FRAME.origin_ecef, FRAME.C_en, r[i], out[i])
+        gravity_into(FRAME.origin_ecef, FRAME.C_en, r[i], out[i])
     np.testing.assert_allclose(out, FRAME.gravity(r), rtol=0, atol=1e-14 * 9.8 * 10)
 
 
