@@ -180,16 +180,11 @@ def wilson(successes: int, n: int, prob: float = 0.95) -> Interval:
     """
     if not 0 <= successes <= n:
         raise InputError(f"successes must lie between 0 and the {n} trials, got {successes}")
-    z = float(-ndtri(_tail(prob)))
-    if n == 0:
-        return Interval(float("nan"), 0.0, 1.0, 0)
-    p = successes / n
-    centre, scale = p + z * z / (2 * n), 1 + z * z / n
-    half = z * np.sqrt(p * (1 - p) / n + (z / (2 * n)) ** 2)
-    # rounding leaves 1e-17 where a bound is 0 or 1 exactly
-    lower = 0.0 if successes == 0 else float((centre - half) / scale)
-    upper = 1.0 if successes == n else float((centre + half) / scale)
-    return Interval(p, lower, upper, n)
+    _tail(prob)
+    from ambiguity import wilson as share_of  # compiled, which a light import must not wait for
+
+    share = share_of(successes, n, prob)
+    return Interval(share.value, share.lower, share.upper, n)
 
 
 def mean_interval(x: Array, prob: float = 0.95) -> Interval:

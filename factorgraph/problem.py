@@ -22,7 +22,16 @@ Kernel = Literal["none", "huber", "cauchy", "geman-mcclure", "tukey"]
 Elevation = Literal["sine", "flat"]
 
 
-def _positive(owner: object, *names: str) -> None:
+def not_negative(owner: object, *names: str) -> None:
+    """Raises InputError naming a field of `owner` that is negative or NaN."""
+    for name in names:
+        value = getattr(owner, name)
+        if not value >= 0:
+            raise InputError(f"{type(owner).__name__}.{name} must not be negative, got {value}")
+
+
+def positive(owner: object, *names: str) -> None:
+    """Raises InputError naming a field of `owner` that is not positive."""
     for name in names:
         value = getattr(owner, name)
         if not value > 0:
@@ -41,8 +50,8 @@ class ImuNoise:
     accel_bias_walk_mps2_rts: float = 2e-4
 
     def __post_init__(self) -> None:
-        _positive(self, "gyro_rps_rthz", "accel_mps2_rthz", "gyro_bias_rps", "accel_bias_mps2")
-        _positive(self, "gyro_bias_walk_rps_rts", "accel_bias_walk_mps2_rts")
+        positive(self, "gyro_rps_rthz", "accel_mps2_rthz", "gyro_bias_rps", "accel_bias_mps2")
+        positive(self, "gyro_bias_walk_rps_rts", "accel_bias_walk_mps2_rts")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +68,7 @@ class GnssNoise:
     elevation: Elevation = "sine"  # "flat": the same at every elevation
 
     def __post_init__(self) -> None:
-        _positive(self, "code_m", "phase_m", "doppler_mps", "absolute_code_m", "absolute_correlation_s")
+        positive(self, "code_m", "phase_m", "doppler_mps", "absolute_code_m", "absolute_correlation_s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +137,7 @@ class Robust:
     width: float = 1.345
 
     def __post_init__(self) -> None:
-        _positive(self, "width")
+        positive(self, "width")
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +153,7 @@ class AmbiguitySettings:
     slip_geometry_free_m: float = 0.05
 
     def __post_init__(self) -> None:
-        _positive(self, "ratio_threshold", "release_sigma", "slip_phase_doppler_cyc", "slip_geometry_free_m")
+        positive(self, "ratio_threshold", "release_sigma", "slip_phase_doppler_cyc", "slip_geometry_free_m")
         if not 0 < self.min_success_rate < 1:
             raise InputError(f"AmbiguitySettings.min_success_rate must lie in (0, 1), got {self.min_success_rate}")
 

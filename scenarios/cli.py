@@ -177,7 +177,7 @@ COMMANDS = {
         ),
         Command(
             "study",
-            "[NAME]",
+            "[NAME [OPTIONS]]",
             "compare estimators over many trials",
             ESTIMATE,
             "scenarios.studies.command:study",
@@ -273,7 +273,10 @@ def _run(argv: list[str]) -> int:
 
 def _parse(command: Command, argv: list[str]) -> argparse.Namespace:
     parser = _Parser(
-        prog=f"relnav {command.name}", description=f"{command.summary[0].upper()}{command.summary[1:]}.", allow_abbrev=False
+        prog=f"relnav {command.name}",
+        usage=f"relnav {command.name} {command.usage}" if command.more_options else None,
+        description=f"{command.summary[0].upper()}{command.summary[1:]}.",
+        allow_abbrev=False,
     )
     if command.add_options is not None:
         command.add_options(parser)

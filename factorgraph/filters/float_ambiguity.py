@@ -30,12 +30,15 @@ import numpy as np
 from numba import njit
 
 from ambiguity import DoubleDifferences, follow
+from factorgraph.errors import InputError
 from factorgraph.filters import adaptive, kalman
 from factorgraph.filters.adaptive import Statistic
 from factorgraph.filters.layout import Layout
+from factorgraph.filters.motion import constant_acceleration
 from factorgraph.models import double_differences as dd
 from factorgraph.models.double_differences import PairEpochs
 from factorgraph.models.robust import bifactor, igg3
+from factorgraph.problem import not_negative, positive
 from factorgraph.types import Array, IntArray
 
 MOTION = Layout(baseline=3, velocity=3, acceleration=3)
@@ -71,13 +74,22 @@ class FloatSettings:
     code_m: float  # undifferenced standard deviation factor: sigma^2 = sigma0^2 (1 + 1 / sin^2 el)
     phase_m: float
     accel_walk: float = 1.0  # m/s^2 per sqrt(s)
-    ambiguity_walk: float = 0.01  # cycles per sqrt(s)
+    ambiguity_walk: float = 1.5  # cycles per sqrt(s): hardly any memory
     c0: float = 1.5  # IGG-III: kept below
     c1: float = 4.5  # rejected above
     c2: float = 2.0  # classified factors: kept below
     statistic: Statistic = "literal"
     code_statistic: Literal["predicted", "postfit"] = "predicted"
-    passes: int = 1
+    passes: int = 1  # at most, of the robust update
+    full_noise: bool = False  # with what the noise of the acceleration does to position and velocity within a step
+
+    def __post_init__(self) -> None:
+        positive(self, "code_m", "phase_m", "c2")
+        not_negative(self, "accel_walk", "ambiguity_walk")
+        if not 0 < self.c0 < self.c1:
+            raise InputError(f"FloatSettings: c0 must lie between 0 and c1, got {self.c0} and {self.c1}")
+        if self.passes < 1:
+            raise InputError(f"FloatSettings.passes must be at least 1, got {self.passes}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,14 +173,11 @@ def single_epoch(data: PairEpochs, k: int, r_reference: Array, settings: FloatSe
 
 
 @njit(cache=True)
-def _time_update(x: Array, P: Array, dt: float, accel_walk: float, ambiguity_walk: float) -> tuple[Array, Array]:
-    n = len(x)
+def _time_update(x: Array, P: Array, dt: float, accel_walk: float, ambiguity_walk: float, full: bool) -> tuple[Array, Array]:
+    n, k = len(x), N0
     Phi, Q = np.eye(n), np.zeros((n, n))
-    for i in range(3):
-        Phi[i, 3 + i] = Phi[3 + i, 6 + i] = dt
-        Phi[i, 6 + i] = 0.5 * dt * dt
-        Q[6 + i, 6 + i] = dt * accel_walk**2
-    for i in range(9, n):
+    Phi[:k, :k], Q[:k, :k] = constant_acceleration(dt, accel_walk, full)
+    for i in range(k, n):
         Q[i, i] = dt * ambiguity_walk**2
     return Phi @ x, kalman.predict(P, Phi, Q)
 
@@ -226,7 +235,8 @@ class FloatFilter:
             return
         dt = t - self._t
         if dt > 0:
-            self._x, self._P = _time_update(self._x, self._P, dt, self.settings.accel_walk, self.settings.ambiguity_walk)
+            s = self.settings
+            self._x, self._P = _time_update(self._x, self._P, dt, s.accel_walk, s.ambiguity_walk, s.full_noise)
             self._t = t
         if disturbance is not None:
             self._x[RATE] += disturbance
@@ -259,10 +269,11 @@ class FloatFilter:
         offset = rho + G @ (x_p[BASE] - b_lin)  # predicted without ambiguities
         nu_code, nu_phase = e.code - offset, e.phase - offset - e.lam * x_p[N0:]
         nu_ins = None if ins is None else ins.b_n - x_p[BASE]
-        x, P = _two_blocks(x_p, P_p, G, e.lam, nu_code, nu_phase, nu_ins, e.R_code, e.R_phase, ins)
+        P_bar = P_p
+        x, P = _two_blocks(x_p, P_bar, G, e.lam, nu_code, nu_phase, nu_ins, e.R_code, e.R_phase, ins)
         weights, gammas = np.ones(len(nu_code)), (1.0, 1.0)
         for _ in range(s.passes if self.scheme.is_robust else 0):
-            found = self._factors(x, P, P_p, e, G, nu_code)
+            found = self._factors(x, P, P_bar, e, G, nu_code)
             if found[0].min() == 1.0 and min(found[1]) == 1.0:
                 break
             weights, gammas = found
@@ -332,6 +343,6 @@ def _two_blocks_kernel(
     H2 = np.zeros((m, n))
     H2[:, :3] = G
     for i in range(m):
-        H2[i, 9 + i] = lam
+        H2[i, N0 + i] = lam
     dx2, P2, _ = kalman.update_sequential(P, nu_phase - H2 @ dx, H2, R_phase)
     return x_p + dx + dx2, P2

@@ -29,10 +29,15 @@ from factorgraph.geodesy import LocalFrame
 from factorgraph.measurements import ImuStream
 from factorgraph.models.preintegration import sample_means
 from factorgraph.models.strapdown import gravity_into, propagate_into, quat_exp, quat_mul
+from factorgraph.problem import not_negative, positive
 from factorgraph.types import Array
 
+LONGEST_GAP_S = 1.0  # of an IMU that a filter bridges with the mean of the samples around
+LATE_S = 0.011  # an epoch after the last sample: one interval at 100 Hz
 INERTIAL = Layout(position=3, velocity=3, attitude=3, gyro_constant=3, gyro_markov=3, accel_markov=3)
 POS, VEL, ATT, GYRO, GYRO_GM, ACCEL = (INERTIAL[name] for name in INERTIAL.names)
+NAVIGATION, SENSORS = slice(POS.start, ATT.stop), slice(GYRO.start, ACCEL.stop)
+_R, _V, _A, _G, _GM, _B = (INERTIAL[name].start for name in INERTIAL.names)  # for kernels, which freeze them
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +61,10 @@ class ImuModel:
     gyro_markov_s: float
     accel_markov_mps2: float
     accel_markov_s: float
+
+    def __post_init__(self) -> None:
+        positive(self, "gyro_markov_s", "accel_markov_s")
+        not_negative(self, *(name for name in self.__slots__ if not name.endswith("_s")))
 
     @property
     def P(self) -> Array:
@@ -90,19 +99,19 @@ def fill_inertial(
 ) -> None:
     """Write the 18 inertial error states' dynamics into the first rows and columns of F (n >= 18, zero before)."""
     for i in range(3):
-        F[i, 3 + i] = 1.0
-        F[12 + i, 12 + i] = -1.0 / tau_g
-        F[15 + i, 15 + i] = -1.0 / tau_a
+        F[_R + i, _V + i] = 1.0
+        F[_GM + i, _GM + i] = -1.0 / tau_g
+        F[_B + i, _B + i] = -1.0 / tau_a
         for j in range(3):
-            F[3 + i, j] = 3.0 * g_over_R * up[i] * up[j]
-            F[3 + i, 15 + j] = C_nb[i, j]
-            F[6 + i, 9 + j] = -C_nb[i, j]
-            F[6 + i, 12 + j] = -C_nb[i, j]
-        F[3 + i, i] -= g_over_R
-    _put_cross(F, 0, 0, w_en, -1.0)
-    _put_cross(F, 3, 3, 2.0 * w_ie + w_en, -1.0)
-    _put_cross(F, 3, 6, f_n, 1.0)  # -phi x f = [f x] phi
-    _put_cross(F, 6, 6, w_ie + w_en, -1.0)
+            F[_V + i, _R + j] = 3.0 * g_over_R * up[i] * up[j]
+            F[_V + i, _B + j] = C_nb[i, j]
+            F[_A + i, _G + j] = -C_nb[i, j]
+            F[_A + i, _GM + j] = -C_nb[i, j]
+        F[_V + i, _R + i] -= g_over_R
+    _put_cross(F, _R, _R, w_en, -1.0)
+    _put_cross(F, _V, _V, 2.0 * w_ie + w_en, -1.0)
+    _put_cross(F, _V, _A, f_n, 1.0)  # -phi x f = [f x] phi
+    _put_cross(F, _A, _A, w_ie + w_en, -1.0)
 
 
 @njit(cache=True)
@@ -172,6 +181,12 @@ class Navigator:
         self.t_s, self.r, self.v = t_s, start.r_n.copy(), start.v_n.copy()
         self.gyro_constant, self.gyro_markov, self.accel, self.w = np.zeros((4, 3))
         self._q = quat_from_matrix(start.C_nb)
+        gap = int(np.argmax(np.diff(imu.t_s))) if len(imu.t_s) > 1 else 0
+        if len(imu.t_s) > 1 and imu.t_s[gap + 1] - imu.t_s[gap] > LONGEST_GAP_S:
+            raise InputError(
+                f"the IMU has no samples from {imu.t_s[gap]:.3f} to {imu.t_s[gap + 1]:.3f} s; "
+                f"filters bridge {LONGEST_GAP_S:g} s, the graph any gap"
+            )
         self._t, (_, self._f, self._w) = imu.t_s, sample_means(imu)
         self._frame = (frame.origin_ecef, np.ascontiguousarray(frame.C_en), frame.w_ie_n)
         self._tau = np.array([model.gyro_markov_s, model.accel_markov_s])
@@ -185,8 +200,10 @@ class Navigator:
     def advance(self, t_s: float) -> tuple[Array, Array]:
         """Propagate to t_s and return the mean specific force in n (3,) and the attitude (3, 3) half way there.
 
-        The Gauss-Markov parts decay as the model says. Beyond the last sample the navigator stays at that sample.
+        The Gauss-Markov parts decay as the model says. Raises InputError where the IMU does not reach t_s.
         """
+        if t_s > self._t[-1] + LATE_S:
+            raise InputError(f"the IMU ends at {self._t[-1]:.3f} s, before the epoch at {t_s:.3f} s; leave later epochs out")
         first = int(np.searchsorted(self._t, self.t_s + 1e-9))
         last = int(np.searchsorted(self._t, t_s + 1e-9))
         t = np.concatenate([[self.t_s], self._t[first:last]])

@@ -3,8 +3,10 @@
 States: the 18 of `inertial`, receiver clock offset [m] and drift [m/s] of one constellation. With e the line of sight to
 a satellite, a = r + C_nb l the antenna,
 
-    P         - predicted = -e . (dr + [C_nb l x] phi) + c dt_u      (errors: estimate - truth, hence H = +e on dr)
-    -lam D    - predicted = -e . dv                    + c ddt_u
+    P      - predicted = e . (dr + [C_nb l x] phi) + c (dt_u - its estimate)
+    -lam D - predicted = e . dv                    + c (ddt_u - its estimate)
+
+The inertial errors are estimate - truth and taken off; what the clock states hold is added to the clock.
 
 Its position is the reference of moving-base differences, so it should be smooth rather than quick: the standard
 deviations told to it are larger than the receiver's noise.
@@ -21,9 +23,11 @@ import numpy as np
 from factorgraph.attitude import skew
 from factorgraph.errors import InputError
 from factorgraph.filters import kalman
-from factorgraph.filters.inertial import ATT, INERTIAL, POS, VEL, ImuModel, InertialStart, Navigator
+from factorgraph.filters.inertial import ATT, INERTIAL, NAVIGATION, POS, SENSORS, VEL, ImuModel, InertialStart, Navigator
 from factorgraph.geodesy import LocalFrame
+from factorgraph.models.gnss import elevation_scale
 from factorgraph.models.receivers import Receiver
+from factorgraph.problem import not_negative, positive
 from factorgraph.types import Array, BoolArray, IntArray
 
 STATES = INERTIAL.extended(clock=1, drift=1)
@@ -32,7 +36,7 @@ CLOCK, DRIFT = STATES["clock"].start, STATES["drift"].start
 
 @dataclass(frozen=True, slots=True)
 class TightSettings:
-    """Undifferenced standard deviations and the clock's behaviour."""
+    """Undifferenced standard deviations, sigma^2 = sigma0^2 (1 + 1 / sin^2 el), and the clock's behaviour."""
 
     code_m: float = 30.0
     doppler_mps: float = 0.005
@@ -40,6 +44,10 @@ class TightSettings:
     drift_mps: float = 100.0
     clock_walk: float = 0.1  # m per sqrt(s)
     drift_walk: float = 0.05  # m/s per sqrt(s)
+
+    def __post_init__(self) -> None:
+        positive(self, "code_m", "doppler_mps", "clock_m", "drift_mps")
+        not_negative(self, "clock_walk", "drift_walk")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +80,7 @@ def run(
     lever = np.asarray(receiver.antenna.lever_b, float)
     times = stream.t_s - receiver.clock_s
     P = np.zeros((STATES.size, STATES.size))
-    P[:9, :9], P[9:18, 9:18] = start.P, model.P
+    P[NAVIGATION, NAVIGATION], P[SENSORS, SENSORS] = start.P, model.P
     P[CLOCK, CLOCK], P[DRIFT, DRIFT] = settings.clock_m**2, settings.drift_mps**2
     q = np.concatenate([model.density, [settings.clock_walk**2, settings.drift_walk**2]])
     nav = Navigator(receiver.vehicle.imu, frame, start, model, float(times[0]))
@@ -103,14 +111,14 @@ def run(
             H = np.zeros((2 * m, STATES.size))
             H[:m, POS], H[:m, ATT], H[:m, CLOCK] = e, e @ skew(place - nav.r), 1.0
             H[m:, VEL], H[m:, DRIFT] = e, 1.0
-            scale = np.sqrt(1 + 1 / np.sin(prepared.elevation_rad[rows]) ** 2)
+            scale = np.sqrt(2.0) * elevation_scale(prepared.elevation_rad[rows])
             sigma = np.concatenate([settings.code_m * scale, settings.doppler_mps * scale])
             dx, P, nis, prior = kalman.step(P, Phi, Q, nu, H, np.diag(sigma**2))
             nav.correct(dx)
             clock, drift = clock + dx[CLOCK], drift + dx[DRIFT]
             track.jump[k] = prior[:6, :6] - P[:6, :6]
             track.nis[k], track.n_rows[k] = nis, 2 * m
-        track.r_n[k], track.v_n[k], track.C_nb[k], track.P[k] = nav.r, nav.v, nav.C, P[:9, :9]
+        track.r_n[k], track.v_n[k], track.C_nb[k], track.P[k] = nav.r, nav.v, nav.C, P[NAVIGATION, NAVIGATION]
         track.antenna_n[k], track.antenna_v_n[k] = nav.point(lever)
     return track
 

@@ -40,14 +40,17 @@ from factorgraph.filters.float_ambiguity import (
     Scheme,
     single_epoch,
 )
-from factorgraph.filters.inertial import ATT, INERTIAL, POS, ImuModel, InertialStart, Navigator
+from factorgraph.filters.inertial import ATT, INERTIAL, NAVIGATION, POS, SENSORS, VEL, ImuModel, InertialStart, Navigator
 from factorgraph.filters.tightly_coupled import TightSettings, TightTrack
 from factorgraph.models import double_differences as dd
 from factorgraph.models.double_differences import PairEpochs, pair_epochs
 from factorgraph.models.receivers import receivers
 from factorgraph.models.robust import bifactor
-from factorgraph.problem import NavigationProblem
+from factorgraph.problem import NavigationProblem, positive
 from factorgraph.types import Array, BoolArray, IntArray
+
+MOVING = slice(POS.start, VEL.stop)
+_SIZE, _R, _V, _A = INERTIAL.size, POS.start, VEL.start, ATT.start  # for kernels
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,11 @@ class TwoStageSettings:
     float_phase: Literal["inflated", "known", "omitted"] = "omitted"
     robust_main: bool = True  # codes have the weights of the subfilter (1 unless its scheme is robust) here, too
     reference_jumps: bool = False  # count the corrections of the reference's filter as noise of the relative state
+
+    def __post_init__(self) -> None:
+        positive(self, "doppler_mps", "k0")
+        if not self.ratio_threshold >= 1:
+            raise InputError(f"TwoStageSettings.ratio_threshold must be at least 1, got {self.ratio_threshold}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +215,7 @@ def run(
     subfilter = FloatFilter(scheme, settings.floats) if floats is None else None
     nav = Navigator(imu, shared.problem.frame, shared.start, shared.model, float(data.t_rover_s[0]))
     P = np.zeros((INERTIAL.size, INERTIAL.size))
-    P[:9, :9], P[9:, 9:] = shared.start.P, shared.model.P
+    P[NAVIGATION, NAVIGATION], P[SENSORS, SENSORS] = shared.start.P, shared.model.P
     q = shared.model.density
     out = _empty_run(data)
     for k in range(n_epochs or data.n_epochs):
@@ -217,7 +225,7 @@ def run(
             f_n, middle = nav.advance(t)
             P = kalman.predict(P, *nav.transition(f_n, middle, q, dt))
             if settings.reference_jumps:
-                P[:6, :6] += shared.reference.jump[k]
+                P[MOVING, MOVING] += shared.reference.jump[k]
         fault = None if disturbance is None else disturbance.velocity_mps[k]
         if disturbance is not None and disturbance.target == "ins":
             nav.v = nav.v + disturbance.velocity_mps[k]
@@ -238,9 +246,11 @@ def run(
             _final_baseline(shared, k, solution, found, fixed, r_a, settings, out)
             out.fixed[k], out.ratio[k] = fixed, found.ratio
             out.adop_cyc[k], out.success_rate[k] = found.adop_cyc, found.success_rate
+        moved = shared.reference.v_n[k] * (t - data.t_reference_s[k])  # the receivers' clocks are not one
+        out.baseline_n[k] -= moved
         out.velocity_n[k] = nav.v - shared.reference.v_n[k]
-        out.main_baseline_n[k] = nav.r - shared.reference.r_n[k]
-        out.main_P[k], out.C_nb[k] = P[:9, :9], nav.C
+        out.main_baseline_n[k] = nav.r - shared.reference.r_n[k] - moved
+        out.main_P[k], out.C_nb[k] = P[NAVIGATION, NAVIGATION], nav.C
         out.resolved.append(found)
         out.floats.append(solution)
     return out
@@ -307,15 +317,15 @@ def _main_rows(
     """Innovations (3m,), their geometry (3m, 18) and covariance (3m, 3m): code, phase, Doppler. Source: erratum E3."""
     rho, rate, G = predicted
     m = len(rho)
-    nu, H, R = np.empty(3 * m), np.zeros((3 * m, 18)), np.zeros((3 * m, 3 * m))
+    nu, H, R = np.empty(3 * m), np.zeros((3 * m, _SIZE)), np.zeros((3 * m, 3 * m))
     nu[:m] = dd.difference(observed[0], order) - rho
     nu[m : 2 * m] = dd.difference(observed[1], order) - ambiguity_m - rho
     nu[2 * m :] = dd.difference(observed[2], order) - rate
-    H[:m, :3] = H[m : 2 * m, :3] = H[2 * m :, 3:6] = -G
+    H[:m, _R : _R + 3] = H[m : 2 * m, _R : _R + 3] = H[2 * m :, _V : _V + 3] = -G
     for i in range(m):
         turned = -np.cross(G[i], arm)
-        H[i, 6:9] = turned
-        H[m + i, 6:9] = turned
+        H[i, _A : _A + 3] = turned
+        H[m + i, _A : _A + 3] = turned
     for j in range(3):
         R[j * m : (j + 1) * m, j * m : (j + 1) * m] = dd.covariance(sigmas[j] ** 2 * scale, order)
     return nu, H, R
@@ -331,12 +341,12 @@ def _final_baseline(
     settings: TwoStageSettings,
     out: TwoStageRun,
 ) -> None:
-    data, order, lam = shared.data, solution.order, shared.data.wavelength_m
-    phase = dd.difference(data.phase_m[k], order)
-    R = dd.covariance(settings.floats.phase_m**2 * data.variance_scale[k], order)
     if not fixed:
         out.baseline_n[k], out.baseline_P[k] = solution.b_n, solution.Q_b
         return
+    data, order, lam = shared.data, solution.order, shared.data.wavelength_m
+    phase = dd.difference(data.phase_m[k], order)
+    R = dd.covariance(settings.floats.phase_m**2 * data.variance_scale[k], order)
     out.baseline_n[k], out.baseline_P[k] = dd.baseline_from_phase(
         phase - lam * found.integers, R, data.sat_reference[k], data.sat_rover[k], order, r_a, solution.b_n
     )

@@ -23,7 +23,7 @@ from numba import njit
 
 from factorgraph.errors import InputError
 from factorgraph.models.arcs import find_arcs
-from factorgraph.models.gnss import PairedRows, pair_rows
+from factorgraph.models.gnss import PairedRows, elevation_scale, pair_rows
 from factorgraph.models.receivers import Receiver
 from factorgraph.problem import Settings
 from factorgraph.types import Array, BoolArray, IntArray
@@ -114,7 +114,7 @@ def _tabled(reference: Receiver, rover: Receiver, pairs: PairedRows, settings: S
         phase_m=phase,
         rate_mps=rate,
         elevation_rad=elevation,
-        variance_scale=1 + 1 / np.sin(elevation) ** 2,
+        variance_scale=2.0 * elevation_scale(elevation) ** 2,
         arc=arc,
         usable=np.isfinite(code) & np.isfinite(phase) & np.isfinite(rate) & (arc >= 0) & moving,
     )

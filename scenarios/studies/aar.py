@@ -10,28 +10,33 @@ Source: spec aar_two_stage.md (Wu et al. 2022).
 from __future__ import annotations
 
 import argparse
+import difflib
 import time
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from factorgraph.consistency import nees
 from factorgraph.errors import InputError
 from factorgraph.filters import two_stage
+from factorgraph.filters.adaptive import Statistic
 from factorgraph.filters.float_ambiguity import FloatSettings, InsBaseline, Scheme
 from factorgraph.filters.tightly_coupled import TightSettings, TightTrack
 from factorgraph.filters.two_stage import Disturbance, Shared, TwoStageRun, TwoStageSettings
+from factorgraph.solution import Fix, Solution
 from factorgraph.types import Array, BoolArray
 from scenarios.published import aar
 from scenarios.published.aar import TANKER, UAV, AarData, AarFlight
 from scenarios.studies.aar_summary import DEFAULT, GRAPH, SWEEP, JobKey, summarise
 from scenarios.studies.study import Arrays, Job, Outcome, Results, seeds
 
-REVISION = 1  # of what a job computes; results of another one are not used again
+T = TypeVar("T")
+REVISION = 2  # of what a job computes; results of another one are not used again
 SCHEMES = dict(zip("12345", Scheme, strict=True))
 FILTERS = tuple(number + letter for number in SCHEMES for letter in "ab")
 UNAIDED = (Scheme.WLS, Scheme.EKF)
@@ -63,9 +68,9 @@ class Variant:
     usual: int = 20  # seeds
     starts: tuple[int, ...] = (0,)
     changes: Mapping[str, Any] = field(default_factory=dict)  # of TwoStageSettings
-    statistic: str = "literal"
+    statistic: Statistic = "literal"
     noise: aar.Noise = "dd"
-    target: str = "subfilter"
+    target: Literal["subfilter", "ins"] = "subfilter"
 
 
 AIDED = ("3a", "3b", "4a", "4b", "5a", "5b")
@@ -97,15 +102,14 @@ class AarStudy:
         )  # fmt: skip
         parser.add_argument(
             "--variants", metavar="NAME", nargs="+", default=None,
-            help=f"readings of the publication: {', '.join(VARIANTS)} (all; with --quick {DEFAULT} and {SWEEP})",
+            help=f"readings of the publication: {', '.join(VARIANTS)} (all; {DEFAULT} of a part; {DEFAULT} and {SWEEP} if quick)",
         )  # fmt: skip
 
     def jobs(self, options: argparse.Namespace) -> Sequence[Job]:
-        _known("data set", options.data, aar.DATA_SETS)
-        _known("algorithm", options.algorithms, (*FILTERS, GRAPH))
-        variants = options.variants or ([DEFAULT, SWEEP] if options.quick else list(VARIANTS))
-        _known("variant", variants, tuple(VARIANTS))
-        out = [job for name in variants for job in _jobs(name, options)]
+        data = _chosen("data set", options.data, aar.DATA_SETS)
+        algorithms = _chosen("algorithm", options.algorithms, (*FILTERS, GRAPH))
+        variants = options.variants or _usual_variants(algorithms, options.quick)
+        out = [job for name in _chosen("variant", variants, tuple(VARIANTS)) for job in _jobs(name, data, algorithms, options)]
         if not out:
             raise InputError("nothing to do: no variant is run with these data sets and algorithms")
         return out
@@ -151,24 +155,46 @@ def _command(options: argparse.Namespace) -> str:
 STUDY = AarStudy()
 
 
-def _known(what: str, given: Sequence[Any], known: Sequence[Any]) -> None:
+def _usual_variants(algorithms: Sequence[str], is_quick: bool) -> list[str]:
+    """The readings that are run when none is named: of a part of the algorithms only the main one."""
+    if not set(FILTERS) <= set(algorithms):
+        return [DEFAULT]
+    return [DEFAULT, SWEEP] if is_quick else list(VARIANTS)
+
+
+def _chosen(what: str, given: Sequence[T], known: Sequence[T]) -> list[T]:
+    """What is asked for, once each and in our order. Raises InputError with the nearest name for what there is not."""
     for value in given:
         if value not in known:
-            raise InputError(f"no {what} {value}; there are {', '.join(map(str, known))}")
+            near = difflib.get_close_matches(str(value), [str(k) for k in known], n=1)
+            hint = f"; did you mean {near[0]}?" if near else ";"
+            raise InputError(f"no {what} {value}{hint} there are {', '.join(map(str, known))}")
+    return [value for value in known if value in given]
 
 
-def _jobs(name: str, options: argparse.Namespace) -> Iterator[Job]:
+def _jobs(name: str, data: Sequence[int], algorithms: Sequence[str], options: argparse.Namespace) -> Iterator[Job]:
     variant = VARIANTS[name]
-    data = [d for d in options.data if d in variant.data]
-    algorithms = [a for a in options.algorithms if a in variant.algorithms]
+    mine = [d for d in data if d in variant.data]
+    filters = [a for a in algorithms if a in variant.algorithms]
+    tuned = {
+        "tuning": parameters(),
+        "changes": dict(variant.changes),
+        "reading": [variant.statistic, variant.noise, variant.target],
+    }
     for seed in seeds(options, variant.usual, quick=3 if name == DEFAULT else 1):
         for start in variant.starts:
-            common = {"variant": name, "seed": seed, "start": start, "data": data, "revision": REVISION}
-            key = f"{name}-{start}-{seed:04d}"
-            if data and (algorithms or (name == SWEEP and options.algorithms)):
-                yield Job(key, {**common, "algorithms": algorithms})
-            if data and name == DEFAULT and GRAPH in options.algorithms:
-                yield Job(f"graph-{start}-{seed:04d}", {**common, "algorithms": [GRAPH]})
+            common = {"variant": name, "seed": seed, "start": start, "data": mine, "revision": REVISION, **tuned}
+            if mine and (filters or name == SWEEP):
+                subset = "" if (mine, filters) == (list(variant.data), list(variant.algorithms)) else _tag(mine, filters)
+                yield Job(f"{name}-{start}-{seed:04d}{subset}", {**common, "algorithms": filters})
+            if mine and name == DEFAULT and GRAPH in algorithms:
+                subset = "" if mine == list(variant.data) else _tag(mine, [])
+                yield Job(f"graph-{start}-{seed:04d}{subset}", {**common, "algorithms": [GRAPH]})
+
+
+def _tag(data: Sequence[int], algorithms: Sequence[str]) -> str:
+    """Keeps the trials of a part apart from those of the whole, which they must not replace."""
+    return f"-{zlib.crc32(f'{list(data)}{list(algorithms)}'.encode()):08x}"
 
 
 def parameters() -> dict[str, object]:
@@ -206,9 +232,8 @@ def settings(noise: aar.Noise, algorithm: str, variant: Variant = VARIANTS[DEFAU
     told = aar.scenario(0, noise).vehicle[0].gnss
     assert told is not None
     sigma, t = told.noise.noise, TUNING
-    statistic: Any = variant.statistic
-    floats = FloatSettings(sigma.code_m, sigma.phase_m, t.accel_walk, t.ambiguity_walk, t.c0, t.c1, t.c2, statistic)
-    base = TwoStageSettings(floats, sigma.doppler_mps, t.ratio_threshold, algorithm.endswith("b"), t.k0, statistic)
+    floats = FloatSettings(sigma.code_m, sigma.phase_m, t.accel_walk, t.ambiguity_walk, t.c0, t.c1, t.c2, variant.statistic)
+    base = TwoStageSettings(floats, sigma.doppler_mps, t.ratio_threshold, algorithm.endswith("b"), t.k0, variant.statistic)
     return replace(base, **variant.changes)
 
 
@@ -220,7 +245,7 @@ def fly(variant_name: str, seed: int, start: int, data: Sequence[int], algorithm
     for number in data:
         case = aar.data_set(prepared.flight, number)
         shared = _share(prepared.flight, case.problem, prepared.tanker)
-        disturbance = Disturbance(case.velocity_fault_mps, variant.target) if np.any(case.velocity_fault_mps) else None  # type: ignore[arg-type]
+        disturbance = Disturbance(case.velocity_fault_mps, variant.target) if np.any(case.velocity_fault_mps) else None
         truth = Truth.of(prepared, shared, case)
         out |= {f"{number}/{name}": x for name, x in truth.shared.items()}
         floats: dict[Scheme, Any] = {}
@@ -271,7 +296,7 @@ class Truth:
     def judge(self, run: TwoStageRun) -> dict[str, Any]:
         """Arrays of one algorithm: indicators and errors, east-north-up."""
         main = np.concatenate([run.main_baseline_n - self.baseline_n, run.velocity_n - self.velocity_n], axis=1)
-        dof = run.main_P[:, :6, :6]
+        moving = run.main_P[:, :6, :6]
         return _small({
             "ratio": run.ratio,
             "adop_cyc": run.adop_cyc,
@@ -281,7 +306,7 @@ class Truth:
             "baseline_error_m": self._enu(run.baseline_n - self.baseline_n),
             "velocity_error_mps": self._enu(main[:, 3:]),
             "main_baseline_error_m": self._enu(main[:, :3]),
-            "nees": nees(main, dof),
+            "nees": nees(main, moving),
             "nis": run.nis,
             "ins_sigma_m": run.ins_sigma_m,
             "alpha": run.alpha,
@@ -323,23 +348,26 @@ def solve_graph(seed: int, start: int, data: Sequence[int]) -> dict[str, Any]:
             solution = registry.solve(case.problem, GRAPH)
             spent = time.perf_counter() - began
             flight = replace(prepared.flight.simulated, problem=case.problem)
-            done[same] = _judge_graph(solution.pairs[0], wrong_times(flight, solution), spent)
+            done[same] = _judge_graph(solution, wrong_times(flight, solution), spent)
     return {f"{number}/{GRAPH}/{name}": x for number in data for name, x in done[{3: 1}.get(number, number)].items()}
 
 
-def _judge_graph(pair: Any, wrong: set[int], spent: float) -> dict[str, Any]:
-    from factorgraph.solution import Fix
-
+def _judge_graph(solution: Solution, wrong: set[int], spent: float) -> dict[str, Any]:
+    """As `Truth.judge`. An epoch is fixed when every ambiguity observed then is held at an integer."""
+    pair, table = solution.pairs[0], solution.ambiguities
     assert pair.truth_enu is not None and pair.truth_velocity_enu is not None
     error = pair.baseline_enu - pair.truth_enu
     unknown = np.full(len(pair.t_s), np.nan)
-    fixed = pair.fix == Fix.FIXED.value
+    held = pair.fix == Fix.FIXED.value
+    for first, last, state in zip(table.t_start_s, table.t_end_s, table.state, strict=True):
+        if state not in ("fixed", "datum"):
+            held &= (pair.t_s < first - HALF_S) | (pair.t_s > last + HALF_S)
     return _small({
         "ratio": unknown,
         "adop_cyc": unknown,
         "success_rate": unknown,
-        "correct": np.array([round(t) not in wrong for t in pair.t_s]) & fixed,
-        "fixed": fixed,
+        "correct": np.array([round(t) not in wrong for t in pair.t_s]) & held,
+        "fixed": held,
         "baseline_error_m": error,
         "velocity_error_mps": pair.velocity_enu - pair.truth_velocity_enu,
         "main_baseline_error_m": error,
@@ -353,6 +381,7 @@ INS_SIGMAS_M = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0)
 BIASES_M = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0)
 BIASED_SIGMA_M = 0.1  # claimed of the biased prior
 SWEEP_EPOCH = 300
+HALF_S = 0.5  # of the interval between epochs
 
 
 def sweep(seed: int) -> dict[str, Any]:

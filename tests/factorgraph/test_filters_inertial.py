@@ -229,11 +229,17 @@ def test_a_start_before_the_first_sample_takes_that_sample() -> None:
 def test_after_the_last_sample_it_is_said() -> None:
     imu, (r, v, C) = sensed(straight, 1.0)
     nav = navigator(imu, r[0], v[0], C[0])
-    nav.advance(1.5)
-    assert nav.t_s == 1.0
-    with pytest.raises(InputError, match=r"no samples from 1\.000 to 2\.000 s") as told:
-        nav.advance(2.0)
+    with pytest.raises(InputError, match=r"the IMU ends at 1\.000 s, before the epoch at 1\.500 s") as told:
+        nav.advance(1.5)
     assert "\n" not in str(told.value)
+
+
+def test_a_long_gap_is_refused() -> None:
+    imu, (r, v, C) = sensed(straight, 4.0)
+    kept = (imu.t_s < 1.0) | (imu.t_s > 2.5)
+    holed = replace(imu, t_s=imu.t_s[kept], f_b=imu.f_b[kept], w_b=imu.w_b[kept])
+    with pytest.raises(InputError, match="no samples from .* filters bridge 1 s"):
+        navigator(holed, r[0], v[0], C[0])
 
 
 def test_instantaneous_samples_are_not_taken_for_means() -> None:
