@@ -49,6 +49,14 @@ class Rows:
 
 
 @dataclass(slots=True)
+class Whitened:
+    """What factors hand out. They hold this alone and not their block: a circle of Python and C++ would never be freed."""
+
+    e: Array = field(default_factory=lambda: np.zeros(0))  # (n,) whitened predicted - measured
+    Jw: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (n, w)
+
+
+@dataclass(slots=True)
 class Block(ABC):
     """Base of all blocks; subclasses say how rows are predicted."""
 
@@ -56,8 +64,7 @@ class Block(ABC):
     y: Array = field(init=False)  # (n,) measured - predicted
     J: Array = field(init=False)  # (n, w) d predicted / d local columns
     w: Array = field(init=False)  # (n,) robust weights
-    e: Array = field(init=False)  # (n,) whitened predicted - measured
-    Jw: Array = field(init=False)  # (n, w) whitened
+    white: Whitened = field(default_factory=Whitened, init=False)
     u: Array = field(init=False)  # (n,) sqrt(w) / sigma
     active: BoolArray = field(init=False)  # (n,) rows in use
     made: gtsam.NonlinearFactorGraph | None = field(default=None, init=False)  # its factors, until their keys change
@@ -69,6 +76,16 @@ class Block(ABC):
     @property
     def n(self) -> int:
         return len(self.rows.sigma)
+
+    @property
+    def e(self) -> Array:
+        """(n,) whitened predicted - measured."""
+        return self.white.e
+
+    @property
+    def Jw(self) -> Array:
+        """(n, w) whitened Jacobian."""
+        return self.white.Jw
 
     @abstractmethod
     def keys(self, f: int) -> list[int]:
@@ -124,9 +141,10 @@ class Block(ABC):
     def whiten(self) -> None:
         self.u = np.sqrt(self.w) / self.rows.sigma
         if self.rows.clocks is None:
-            self.e, self.Jw = -self.u * self.y, self.u[:, None] * self.J
+            self.white.e, self.white.Jw = -self.u * self.y, self.u[:, None] * self.J
         else:
-            self.e, self.Jw = -self.rows.clocks.project(self.y, self.u), self.rows.clocks.project(self.J, self.u)
+            clocks = self.rows.clocks
+            self.white.e, self.white.Jw = -clocks.project(self.y, self.u), clocks.project(self.J, self.u)
 
     def slices(self, f: int) -> tuple[int, int]:
         start = self.rows.factor.start
@@ -155,12 +173,14 @@ class Block(ABC):
     def _carrier(self, f: int, i: int, j: int, edges: list[tuple[int, int]]) -> gtsam.CustomFactor:
         """A factor that hands out rows i:j of what `whiten` computed."""
 
+        white = self.white
+
         def error(_factor: gtsam.CustomFactor, _values: gtsam.Values, jacobians: list[Array] | None) -> Array:
             if jacobians is not None:
-                Jw = self.Jw[i:j]
+                Jw = white.Jw[i:j]
                 for slot, (a, b) in enumerate(edges):
                     jacobians[slot] = Jw[:, a:b]
-            return self.e[i:j]
+            return white.e[i:j]
 
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(j - i), self.keys(f), error)
 
@@ -504,14 +524,16 @@ class GnssBlock(Block):
         own = len(edges)
         matrix = c.matrix(f)
 
+        white = self.white
+
         def error(_factor: gtsam.CustomFactor, _values: gtsam.Values, jacobians: list[Array] | None) -> Array:
             if jacobians is not None:
-                Jw = self.Jw[i:j]
+                Jw = white.Jw[i:j]
                 for slot, (a, b) in enumerate(edges):
                     jacobians[slot] = Jw[:, a:b]
                 for k in range(width):
                     jacobians[own + k] = matrix[:, k : k + 1]
-            return self.e[i:j]
+            return white.e[i:j]
 
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(j - i), self.keys(f), error)
 

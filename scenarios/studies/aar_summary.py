@@ -1,16 +1,18 @@
 """Statistics of the aerial-refuelling study: its trials reduced to numbers with intervals over the seeds.
 
 Trials are read one at a time; of each only scalars are kept. An algorithm is an ambiguity scheme (1 WLS, 2 EKF, 3 IEKF,
-4 IBRKF, 5 IBRCAF) with a main filter (a standard, b adaptive), or "graph". Errors are norms of three components.
+4 IBRKF, 5 IBRCAF) with a main filter (a standard, SKF; b adaptive, AKF), or "graph". Errors are norms of three components.
 
-    P_corr   epochs whose integer least-squares solution is right        P_fix   epochs with ratio >= 3
-    P_SE     epochs with both, all in percent of all epochs              wrong   of the fixed epochs, those with a wrong integer
+    P_corr   epochs whose integer least-squares solution is right; the graph has none
+    P_fix    epochs with ratio >= 3; of the graph, those at which every satellite used has its integer held
+    P_SE     epochs that are fixed and right. All in percent of all epochs
+    wrong    of the fixed epochs, those with a wrong integer
     ratio    second smallest over smallest squared norm; above 1000 it counts as 1000, epochs without one are left out
     NEES     of relative position and velocity (6), of the graph's baseline (3); an estimator is called consistent where
              the mean over the seeds lies in its 99 % band at 90 % of the epochs
 
 Intervals are 95 % bootstrap intervals over the seeds, differences are paired: both methods saw the same noise.
-Source: two-stage adaptive relative navigation for aerial refuelling, eqs. 31 to 33, for ratio, ADOP and P_SE.
+Source: Wu and others 2022, eqs. 31 to 33, for ratio, ADOP and P_SE.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from factorgraph.consistency import Interval, band, mean_difference, paired_bootstrap, wilson
+from factorgraph.consistency import Interval, band, mean_difference, paired_bootstrap
 from factorgraph.errors import InputError
 from factorgraph.types import Array, BoolArray
 
@@ -137,17 +139,12 @@ class Row:
     cell: Cell
     n_epochs: int
     seeds: tuple[int, ...]
-    successes: tuple[int, ...]  # epochs rightly fixed, per seed; of the main set
     nees_consistent: float  # % of epochs at which the mean NEES over the seeds is in its 99 % band
     statistics: Mapping[str, Statistic]
 
     @property
     def is_consistent(self) -> bool:
         return not self.nees_consistent < CONSISTENT_PCT
-
-    def wilson(self) -> list[Interval]:
-        """P_SE of every seed as a share with Wilson's interval."""
-        return [wilson(k, self.n_epochs) for k in self.successes]
 
     def at_times(self, metric: str) -> list[tuple[float, Statistic]]:
         """The "metric@t" statistics by time [s]."""
@@ -209,10 +206,6 @@ class Summary:
 
     def curve(self, name: str) -> Curve | None:
         return next((curve for curve in self.curves if curve.name == name), None)
-
-    def scheme(self, digit: str, data: int, variant: str = DEFAULT) -> str:
-        """The algorithm that stands for an ambiguity scheme: with the adaptive main filter where it was run."""
-        return digit + ("b" if self.row(digit + "b", data, variant) or not self.row(digit + "a", data, variant) else "a")
 
     def seeds(self, data: int, variant: str = DEFAULT, start: int = 0) -> tuple[int, ...]:
         """Seeds of a data set, those of any algorithm."""
@@ -294,7 +287,7 @@ def measure(arrays: Mapping[str, Array], algorithm: str, data: int) -> dict[str,
         size("main_baseline_error_m"),
     )
     found = {
-        "p_corr": _percent(right),
+        "p_corr": _percent(right) if algorithm != GRAPH else NAN,
         "p_fix": _percent(fixed),
         "p_se": _percent(success),
         "wrong_fix": _percent(~right[fixed]),
@@ -405,7 +398,6 @@ class _Trials:
 
     def __init__(self) -> None:
         self.values: dict[Cell, dict[int, dict[str, float]]] = defaultdict(dict)
-        self.successes: dict[Cell, dict[int, int]] = defaultdict(dict)
         self.nees: dict[Cell, tuple[Array, Array]] = {}  # sum and count, (K,)
 
     def add(self, key: JobKey, arrays: Mapping[str, Array]) -> None:
@@ -416,8 +408,6 @@ class _Trials:
             if len(total) != K:
                 raise InputError(f"{key}: {K} epochs, other trials of this data set have {len(total)}; run them again alike")
             self.values[cell][key.seed] = measure(arrays, algorithm, key.data)
-            both = (np.asarray(arrays[f"{algorithm}/correct"]) > 0) & (np.asarray(arrays[f"{algorithm}/fixed"]) > 0)
-            self.successes[cell][key.seed] = int(np.sum(both))
             if f"{algorithm}/nees" in arrays:
                 nees = np.asarray(arrays[f"{algorithm}/nees"], float)
                 total += np.where(np.isfinite(nees), nees, 0.0)
@@ -432,9 +422,8 @@ class _Trials:
         names = names if cell.variant == DEFAULT else {name: None for name in names if name in VARIANT_KEPT}
         statistics = {name: _statistic(np.array([values[s][name] for s in seeds if name in values[s]])) for name in names}
         total, count = self.nees[cell]
-        successes = tuple(self.successes[cell][seed] for seed in seeds) if cell.variant == DEFAULT else ()
         consistent = _rounded(_nees_consistent(total, count, nees_dimension(cell.algorithm)))
-        return Row(cell, len(total), seeds, successes, consistent, statistics)
+        return Row(cell, len(total), seeds, consistent, statistics)
 
     def differences(self) -> tuple[Difference, ...]:
         found = []
@@ -491,41 +480,33 @@ def _difference(metric: str, first: Cell, second: Cell, a: Array, b: Array) -> D
 
 
 SCHEME_METRICS = ("p_se", "ratio_mean", "baseline_rms", "velocity_rms")
-FAULT_METRICS = ("fault_p_se", "fault_baseline_max")
+FAULT_METRICS = ("fault_p_se",)
 FILTER_METRICS = ("baseline_rms", "velocity_rms", "velocity_max", "p_se", "velocity_manoeuvre", "velocity_elsewhere")
-VARIANT_METRICS = ("p_se", "baseline_rms", "velocity_rms")
-SCHEME_PAIRS = ("12", "23", "13", "34", "45", "35", "3g", "5g")
+SCHEME_PAIRS = ("12", "23", "13", "34", "45", "3g", "5g")
 
 
 def _comparisons(cells: list[Cell]) -> Iterator[tuple[str, Cell, Cell]]:
-    """Metric, first and second of everything that is compared."""
+    """Metric, first and second of everything that is compared: schemes beside the same main filter, filters, variants."""
     here = set(cells)
 
-    def head(data: int, digit: str) -> Cell:
-        if digit == "g":
-            return Cell(DEFAULT, data, GRAPH)
-        adaptive = Cell(DEFAULT, data, digit + "b")
-        return adaptive if adaptive in here else Cell(DEFAULT, data, digit + "a")
+    def of(data: int, digit: str, main: str) -> Cell:
+        return Cell(DEFAULT, data, GRAPH if digit == "g" else digit + main)
 
     wanted: list[tuple[tuple[str, ...], Cell, Cell]] = []
     for data in sorted({cell.data for cell in cells}):
-        for pair in SCHEME_PAIRS:
-            wanted.append((SCHEME_METRICS + FAULT_METRICS, head(data, pair[0]), head(data, pair[1])))
+        for main in FILTERS:
+            for pair in SCHEME_PAIRS:
+                wanted.append((SCHEME_METRICS + FAULT_METRICS, of(data, pair[0], main), of(data, pair[1], main)))
+            if data != 1:
+                wanted += [(("p_se",), of(1, digit, main), of(data, digit, main)) for digit in SCHEMES]
         for digit in SCHEMES:
-            wanted.append((FILTER_METRICS, Cell(DEFAULT, data, digit + "a"), Cell(DEFAULT, data, digit + "b")))
-        if data != 1:
-            wanted += [(("p_se", "ratio_mean"), head(1, digit), head(data, digit)) for digit in SCHEMES]
+            wanted.append((FILTER_METRICS, of(data, digit, "a"), of(data, digit, "b")))
     for cell in cells:
-        main = Cell(DEFAULT, cell.data, cell.algorithm)
-        if (
-            cell.variant != DEFAULT
-            and cell.start == 0
-            and cell.algorithm in (head(cell.data, cell.algorithm[0]).algorithm, GRAPH)
-        ):
-            wanted.append((VARIANT_METRICS, main, cell))
-    for metrics, first, second in wanted:
-        if first in here and second in here:
-            yield from ((metric, first, second) for metric in metrics)
+        if cell.variant != DEFAULT and cell.start == 0:
+            wanted.append((("p_se",), Cell(DEFAULT, cell.data, cell.algorithm), cell))
+    for metrics, one, other in wanted:
+        if one in here and other in here:
+            yield from ((metric, one, other) for metric in metrics)
 
 
 # sweeps of figures 7 and 8
@@ -589,7 +570,6 @@ def to_json(summary: Summary) -> dict[str, Any]:
                 "epochs": row.n_epochs,
                 "seeds": _runs(row.seeds),
                 "n_seeds": len(row.seeds),
-                "successes": list(row.successes),
                 "nees_consistent": _plain(row.nees_consistent),
                 "statistics": {name: _listed(value, len(row.seeds)) for name, value in row.statistics.items()},
             }
@@ -617,7 +597,6 @@ def from_json(content: Mapping[str, Any]) -> Summary:
             Cell(*row["cell"]),
             row["epochs"],
             tuple(seed for first, last in row["seeds"] for seed in range(first, last + 1)),
-            tuple(row["successes"]),
             _number(row["nees_consistent"]),
             {name: _read(value, row["n_seeds"]) for name, value in row["statistics"].items()},
         )

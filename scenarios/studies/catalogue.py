@@ -10,7 +10,13 @@ from scenarios.studies.study import Study
 STUDIES = Names(
     "study",
     "relnav.studies",
-    (Named("aar", "scenarios.studies.aar:STUDY", "two-stage relative navigation for aerial refuelling, as published"),),
+    (
+        Named(
+            "aar",
+            "scenarios.studies.aar:STUDY",
+            "two-stage relative navigation for aerial refuelling, after Wu and others (2022)",
+        ),
+    ),
 )
 
 

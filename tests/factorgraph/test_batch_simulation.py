@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from dataclasses import replace
 from functools import cache
 
@@ -9,12 +10,14 @@ import numpy as np
 import pytest
 
 from factorgraph.attitude import log_so3, matrix_from_quat
+from factorgraph.graphs.blocks import Block
 from factorgraph.problem import Link, NavigationProblem
 from factorgraph.registry import solve
 from factorgraph.solution import POS, Fix, PairSolution, Solution, Status
 from factorgraph.types import Array
-from scenarios.simulate import SimulatedFlight, simulate
+from scenarios.simulate import SimulatedFlight, load_scenario, simulate
 from scenarios.simulate.scenario import parse
+from scenarios.studies import replace_duration
 from tests.helpers import assert_consistent
 
 INFO = """
@@ -284,3 +287,16 @@ def test_the_same_problem_gives_the_same_solution() -> None:
     flight, solution = pair_flight(1.0, 11)
     again = solve(flight.problem)
     np.testing.assert_allclose(again.pair("a", "b").baseline_enu, solution.pair("a", "b").baseline_enu, atol=1e-9)
+
+
+def test_a_solved_graph_is_freed() -> None:
+    """Factors made in Python refer to nothing that refers to them: memory of many solutions does not add up."""
+
+    def living_blocks() -> int:
+        gc.collect()
+        return sum(isinstance(o, Block) for o in gc.get_objects())
+
+    problem = simulate(replace_duration(load_scenario("two-uav"), 10.0), 1).problem
+    before = living_blocks()
+    solve(problem, "graph")
+    assert living_blocks() == before

@@ -238,7 +238,7 @@ def test_a_long_gap_is_refused() -> None:
     imu, (r, v, C) = sensed(straight, 4.0)
     kept = (imu.t_s < 1.0) | (imu.t_s > 2.5)
     holed = replace(imu, t_s=imu.t_s[kept], f_b=imu.f_b[kept], w_b=imu.w_b[kept])
-    with pytest.raises(InputError, match="no samples from .* filters bridge 1 s"):
+    with pytest.raises(InputError, match=r"no samples from .* filters bridge 1 s"):
         navigator(holed, r[0], v[0], C[0])
 
 

@@ -44,6 +44,17 @@ def test_every_figure_has_its_counterpart(whole: Path) -> None:
     assert whole.stat().st_size < 15e6
 
 
+def test_both_main_filters_and_the_readings_are_shown(whole: Path) -> None:
+    text = whole.read_text(encoding="utf-8")
+    (ratios,) = [c for c in charts_of(text) if c["layout"].get("xaxis", {}).get("type") == "multicategory"]
+    assert [trace["name"] for trace in ratios["data"]] == ["SKF", "AKF", "published"]
+    assert "Readings and departures" in text and text.index('id="readings"') < text.index('id="claims"')
+    assert "with SKF | AKF" in text and "Data 3 is Data 1 to it" in text and "told the simulated noise" in text
+    assert "What the robust schemes bring" in text
+    visible = text.split('<script type="text/plain"')[0].lower()
+    assert "acceptance" not in visible and "as published" not in visible and "after wu" in visible
+
+
 def test_timelines_show_the_first_seed_with_shaded_windows(whole: Path) -> None:
     text = whole.read_text(encoding="utf-8")
     assert "Timelines show seed 1" in text
