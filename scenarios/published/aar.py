@@ -34,7 +34,7 @@ from scenarios.simulate.streams import Streams
 
 NAME = "aar"
 TANKER, UAV = "tanker", "uav"
-# Hours of the day with exactly 10 satellites above 25 deg all through the flight. The publication's sky is not known: the first
+# Hours of the day with 10 or 11 satellites above 25 deg all through the flight. The publication's sky is not known: the first
 # is the one whose single-epoch success (0.60) and mean ratio (4.1) come nearest to its 0.575 and 4.35; the others reach up to
 # 0.9 and 6.5.
 START_TIMES = (8.0, 11.0, 14.0, 17.0, 20.0, 23.0, 1.0, 5.0)

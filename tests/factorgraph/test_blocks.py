@@ -25,12 +25,12 @@ from factorgraph.graphs.build import (
     motion_block,
     position_blocks,
     range_blocks,
-    receivers,
 )
 from factorgraph.graphs.optimizer import Graph
 from factorgraph.graphs.variables import VehicleVariables, key
 from factorgraph.measurements import GnssStream, HeightStream, ImuStream, PositionStream, RangeStream, Tag
 from factorgraph.models.differencing import CommonGroups
+from factorgraph.models.receivers import receivers
 from factorgraph.problem import AmbiguitySettings, Antenna, Link, NavigationProblem, RangeModel, Settings, Vehicle
 from factorgraph.types import Array
 from tests.factorgraph.synthetic import FRAME, every, receiver

