@@ -210,15 +210,15 @@ class FloatFilter:
             self._predict(t, disturbance)
             return None
         e = _epoch(data, k, order, r_reference, self.settings)
-        if not len(self._x) and not self._start(data, k, r_reference, ins):
-            return None
+        if not len(self._x):
+            self._start(data, k, r_reference, ins)
         self._predict(t, disturbance)
         self._carry(e, arc)
         out = self._update(e, ins if self.scheme.has_ins else None)
         self._order, self._arc, self._t = order, np.where(data.usable[k], arc, -1), t
         return out
 
-    def _start(self, data: PairEpochs, k: int, r_reference: Array, ins: InsBaseline | None) -> bool:
+    def _start(self, data: PairEpochs, k: int, r_reference: Array, ins: InsBaseline | None) -> None:
         if ins is not None and self.scheme.has_ins:
             b = ins.b_n
         else:
@@ -228,7 +228,6 @@ class FloatFilter:
         self._x = np.concatenate([b, np.zeros(6)])
         self._P = np.diag(START_SIGMA**2)
         self._t = float(data.t_rover_s[k])
-        return True
 
     def _predict(self, t: float, disturbance: Array | None) -> None:
         if not len(self._x):
@@ -268,9 +267,8 @@ class FloatFilter:
         rho, G = e.predict(b_lin)
         offset = rho + G @ (x_p[BASE] - b_lin)  # predicted without ambiguities
         nu_code, nu_phase = e.code - offset, e.phase - offset - e.lam * x_p[N0:]
-        nu_ins = None if ins is None else ins.b_n - x_p[BASE]
         P_bar = P_p
-        x, P = _two_blocks(x_p, P_bar, G, e.lam, nu_code, nu_phase, nu_ins, e.R_code, e.R_phase, ins)
+        x, P = _two_blocks(x_p, P_bar, G, e.lam, nu_code, nu_phase, e.R_code, e.R_phase, ins)
         weights, gammas = np.ones(len(nu_code)), (1.0, 1.0)
         for _ in range(s.passes if self.scheme.is_robust else 0):
             found = self._factors(x, P, P_bar, e, G, nu_code)
@@ -279,7 +277,7 @@ class FloatFilter:
             weights, gammas = found
             R = bifactor(e.R_code, weights)
             P_bar = adaptive.classified(P_p, [(CLASS_1, gammas[0]), (slice(N0, None), gammas[1])])
-            x, P = _two_blocks(x_p, P_bar, G, e.lam, nu_code, nu_phase, nu_ins, R, e.R_phase, ins)
+            x, P = _two_blocks(x_p, P_bar, G, e.lam, nu_code, nu_phase, R, e.R_phase, ins)
         self._x, self._P = x, P
         return FloatSolution(e.order, x[N0:], P[N0:, N0:], x[BASE], P[BASE, BASE], P[BASE, N0:], weights, gammas)
 
@@ -310,16 +308,12 @@ def _two_blocks(
     lam: float,
     nu_code: Array,
     nu_phase: Array,
-    nu_ins: Array | None,
     R_code: Array,
     R_phase: Array,
     ins: InsBaseline | None,
 ) -> tuple[Array, Array]:
-    has_ins = ins is not None and nu_ins is not None
-    return _two_blocks_kernel(
-        x_p, P_p, G, lam, nu_code, nu_phase, R_code, R_phase,
-        has_ins, nu_ins if nu_ins is not None else np.zeros(3), ins.R if ins is not None else np.zeros((3, 3)),
-    )  # fmt: skip
+    nu_ins, R_ins = (np.zeros(3), np.zeros((3, 3))) if ins is None else (ins.b_n - x_p[BASE], ins.R)
+    return _two_blocks_kernel(x_p, P_p, G, lam, nu_code, nu_phase, R_code, R_phase, ins is not None, nu_ins, R_ins)
 
 
 @njit(cache=True)

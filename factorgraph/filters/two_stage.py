@@ -80,6 +80,10 @@ class Disturbance:
     velocity_mps: Array  # (K, 3)
     target: Literal["subfilter", "ins"] = "subfilter"
 
+    def of(self, target: str, k: int) -> Array | None:
+        """What is added to the velocity of a target (3,) at epoch k."""
+        return self.velocity_mps[k] if target == self.target else None
+
 
 @dataclass(frozen=True, slots=True)
 class Shared:
@@ -191,7 +195,7 @@ def float_solutions(
         if subfilter is None:
             solution = single_epoch(data, k, r_a, settings, b)
         else:
-            fault = disturbance.velocity_mps[k] if disturbance and disturbance.target == "subfilter" else None
+            fault = None if disturbance is None else disturbance.of("subfilter", k)
             solution = subfilter.step(data, k, r_a, None if ins is None else ins[k], fault)
         b = b if solution is None else solution.b_n
         out.append(solution)
@@ -226,10 +230,9 @@ def run(
             P = kalman.predict(P, *nav.transition(f_n, middle, q, dt))
             if settings.reference_jumps:
                 P[MOVING, MOVING] += shared.reference.jump[k]
-        fault = None if disturbance is None else disturbance.velocity_mps[k]
-        if disturbance is not None and disturbance.target == "ins":
-            nav.v = nav.v + disturbance.velocity_mps[k]
-            fault = None
+        fault, push = (None, None) if disturbance is None else (disturbance.of("subfilter", k), disturbance.of("ins", k))
+        if push is not None:
+            nav.v = nav.v + push
         r_a = shared.reference.antenna_n[k]
         place, _ = nav.point(shared.lever_rover)
         R_ins = _antenna_covariance(P, place - nav.r)

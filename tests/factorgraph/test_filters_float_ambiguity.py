@@ -125,7 +125,7 @@ def test_two_blocks_are_the_batch_update(seed: int, m: int, aided: bool) -> None
     ins = InsBaseline(rng.normal(size=3), np.diag(rng.uniform(0.01, 1.0, 3)))
     nu_code, nu_phase = rng.normal(size=m), rng.normal(size=m)
     nu_ins = ins.b_n - x[:3] if aided else None
-    found, P_found = fa._two_blocks(x, P, G, LAM, nu_code, nu_phase, nu_ins, R_code, R_phase, ins if aided else None)
+    found, P_found = fa._two_blocks(x, P, G, LAM, nu_code, nu_phase, R_code, R_phase, ins if aided else None)
     zeros, eye = np.zeros((m, m)), np.eye(3)
     H = np.block([[G, np.zeros((m, 6)), zeros], [eye, np.zeros((3, 6 + m))], [G, np.zeros((m, 6)), LAM * np.eye(m)]])
     R = np.zeros((2 * m + 3, 2 * m + 3))
