@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from factorgraph.errors import InputError
+from factorgraph.errors import InputError, not_negative
 from factorgraph.types import Array, IntArray
 
 
@@ -41,6 +41,33 @@ class ReadReport:
     n_rows: int
     dropped: dict[str, int] = field(default_factory=dict)  # reason -> rows
     notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What the flight estimates of a sensor beside its declared installation: prior standard deviations, 0: as declared.
+
+    Each kind of sensor says which of them it knows; the others must be 0.
+    """
+
+    lever_m: float = 0.0  # of the lever arm, each axis
+    time_s: float = 0.0  # of a constant offset of its time tags: taken at tag - offset
+    scale: float = 0.0
+    bias: float = 0.0  # in the sensor's unit
+    bias_walk: float = 0.0  # of the bias, per sqrt(s)
+    mounting_rad: float = 0.0  # rotation of the sensor against the body, each axis
+
+    def __post_init__(self) -> None:
+        not_negative(self, "lever_m", "time_s", "scale", "bias", "bias_walk", "mounting_rad")
+
+    def only(self, owner: str, *known: str) -> None:
+        """Raises InputError where something is asked for that `owner` cannot estimate."""
+        for name in ("lever_m", "time_s", "scale", "bias", "bias_walk", "mounting_rad"):
+            if getattr(self, name) > 0 and name not in known:
+                raise InputError(f"{owner}: calibration.{name} cannot be estimated; it knows {', '.join(known)}")
+
+
+AS_DECLARED = Calibration()
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,9 +173,17 @@ class PositionStream:
     sigma_m: Array  # (n, 3) per axis of n
     lever_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
     name: str = "position"
+    v_n: Array | None = None  # (n, 3) velocity of the antenna, where the source gives it; NaN where it does not
+    sigma_mps: Array | None = None  # (n, 3) per axis of n
+    calibration: Calibration = AS_DECLARED
 
     def __post_init__(self) -> None:
         n = len(self.t_s)
+        self.calibration.only(self.name, "lever_m", "time_s")
+        if (self.v_n is None) != (self.sigma_mps is None):
+            raise InputError(f"{self.name}: give both v_n and sigma_mps or neither")
+        if self.v_n is not None:
+            _check(self, v_n=(n, 3), sigma_mps=(n, 3))
         _check(self, t_s=(n,), r_n=(n, 3), sigma_m=(n, 3))
         _check_time(self, self.t_s)
 
@@ -162,10 +197,92 @@ class HeightStream:
     sigma_m: Array  # (n,)
     lever_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
     name: str = "height"
+    calibration: Calibration = AS_DECLARED  # a barometer has a bias that walks
 
     def __post_init__(self) -> None:
         n = len(self.t_s)
+        self.calibration.only(self.name, "bias", "bias_walk", "time_s")
         _check(self, t_s=(n,), up_m=(n,), sigma_m=(n,))
+        _check_time(self, self.t_s)
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityStream:
+    """Velocity of a point of the vehicle along its body axes (RFU): an odometer has the forward component only."""
+
+    t_s: Array  # (n,)
+    v_b: Array  # (n, 3) NaN where not measured
+    sigma_mps: Array  # (n, 3)
+    lever_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    name: str = "odometer"
+    calibration: Calibration = AS_DECLARED
+
+    def __post_init__(self) -> None:
+        n = len(self.t_s)
+        self.calibration.only(self.name, "lever_m", "time_s", "scale", "mounting_rad")
+        _check(self, t_s=(n,), v_b=(n, 3), sigma_mps=(n, 3))
+        _check_time(self, self.t_s)
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeStream:
+    """Attitude of the vehicle from a reference system; `sigma_rad` is infinite about axes that it does not tell."""
+
+    t_s: Array  # (n,)
+    q_nb: Array  # (n, 4) body to n, scalar first
+    sigma_rad: Array  # (n, 3) of the rotation error about east, north, up
+    name: str = "attitude"
+    calibration: Calibration = AS_DECLARED
+
+    def __post_init__(self) -> None:
+        n = len(self.t_s)
+        self.calibration.only(self.name, "time_s", "mounting_rad")
+        _check(self, t_s=(n,), q_nb=(n, 4), sigma_rad=(n, 3))
+        _check_time(self, self.t_s)
+
+
+@dataclass(frozen=True, slots=True)
+class MagneticStream:
+    """Magnetic field in the body frame, in the unit of the reference field; the bias is hard iron."""
+
+    t_s: Array  # (n,)
+    m_b: Array  # (n, 3)
+    sigma: Array  # (n, 3)
+    field_n: tuple[float, float, float]  # Earth's field in n
+    name: str = "magnetometer"
+    calibration: Calibration = AS_DECLARED
+
+    def __post_init__(self) -> None:
+        n = len(self.t_s)
+        self.calibration.only(self.name, "bias", "mounting_rad")
+        _check(self, t_s=(n,), m_b=(n, 3), sigma=(n, 3))
+        _check_time(self, self.t_s)
+
+
+@dataclass(frozen=True, slots=True)
+class VisionStream:
+    """Direction, and where known range, from a camera or radar on a vehicle to a point of another or a landmark.
+
+    Azimuth counts clockwise from the body's forward axis, elevation up from its right-forward plane.
+    """
+
+    t_s: Array  # (n,)
+    observer: Tag
+    target: Tag
+    azimuth_rad: Array  # (n,) NaN where not measured
+    elevation_rad: Array  # (n,)
+    range_m: Array  # (n,) NaN where not measured
+    sigma_rad: Array  # (n,)
+    sigma_m: Array  # (n,)
+    name: str = "vision"
+    calibration: Calibration = AS_DECLARED
+
+    def __post_init__(self) -> None:
+        n = len(self.t_s)
+        if self.observer.vehicle is None:
+            raise InputError(f"{self.name}: the observer {self.observer.name} must be on a vehicle")
+        self.calibration.only(self.name, "mounting_rad", "time_s")
+        _check(self, t_s=(n,), azimuth_rad=(n,), elevation_rad=(n,), range_m=(n,), sigma_rad=(n,), sigma_m=(n,))
         _check_time(self, self.t_s)
 
 

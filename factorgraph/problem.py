@@ -12,30 +12,27 @@ from typing import Literal
 
 import numpy as np
 
-from factorgraph.errors import InputError
+from factorgraph.errors import InputError, not_negative, positive
 from factorgraph.geodesy import LocalFrame
 from factorgraph.gpstime import GpsTime
-from factorgraph.measurements import GnssStream, HeightStream, ImuStream, PositionStream, RangeStream, Truth
+from factorgraph.measurements import (
+    AS_DECLARED,
+    AttitudeStream,
+    Calibration,
+    GnssStream,
+    HeightStream,
+    ImuStream,
+    MagneticStream,
+    PositionStream,
+    RangeStream,
+    Truth,
+    VelocityStream,
+    VisionStream,
+)
 
 Vec3 = tuple[float, float, float]
 Kernel = Literal["none", "huber", "cauchy", "geman-mcclure", "tukey"]
 Elevation = Literal["sine", "flat"]
-
-
-def not_negative(owner: object, *names: str) -> None:
-    """Raises InputError naming a field of `owner` that is negative or NaN."""
-    for name in names:
-        value = getattr(owner, name)
-        if not value >= 0:
-            raise InputError(f"{type(owner).__name__}.{name} must not be negative, got {value}")
-
-
-def positive(owner: object, *names: str) -> None:
-    """Raises InputError naming a field of `owner` that is not positive."""
-    for name in names:
-        value = getattr(owner, name)
-        if not value > 0:
-            raise InputError(f"{type(owner).__name__}.{name} must be positive, got {value}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,11 +86,49 @@ class Antenna:
     stream: GnssStream
     lever_b: Vec3 = (0.0, 0.0, 0.0)
     noise: GnssNoise = GnssNoise()
+    calibration: Calibration = AS_DECLARED
+
+    def __post_init__(self) -> None:
+        self.calibration.only("gnss", "lever_m", "time_s")
+
+
+@dataclass(frozen=True, slots=True)
+class ImuCalibration:
+    """What the flight estimates of an IMU: prior standard deviations, 0: as declared."""
+
+    time_s: float = 0.0  # offset of its time tags: sampled at tag - offset
+    gyro_scale: float = 0.0  # each axis
+    accel_scale: float = 0.0
+
+    def __post_init__(self) -> None:
+        not_negative(self, "time_s", "gyro_scale", "accel_scale")
+
+
+@dataclass(frozen=True, slots=True)
+class Constraints:
+    """What is known of how a vehicle moves; 0: not used. They act every `interval_s`."""
+
+    lateral_mps: float = 0.0  # non-holonomic: sideways velocity of `axle_b` in the body frame
+    vertical_mps: float = 0.0  # upward velocity of it
+    axle_b: Vec3 = (0.0, 0.0, 0.0)  # a point that does not slip: the middle of the rear axle
+    mounting_rad: float = 0.0  # prior of the IMU's yaw and pitch against the direction of travel; 0: aligned
+    zero_velocity_mps: float = 0.0  # while the IMU shows rest
+    zero_rotation_rps: float = 0.0
+    height_mps: float = 0.0  # height hold: vertical velocity in n
+    interval_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        not_negative(self, "lateral_mps", "vertical_mps", "mounting_rad", "zero_velocity_mps", "zero_rotation_rps", "height_mps")
+        positive(self, "interval_s")
 
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """A moving vehicle, or a base station when `fixed_n` gives its antenna's known position."""
+    """A moving vehicle, or a base station when `fixed_n` gives its antenna's known position.
+
+    A further antenna of a vehicle is a vehicle of its own that names its `carrier`: it has `gnss`, with the lever arm from the
+    carrier's body origin, and no state.
+    """
 
     name: str
     imu: ImuStream | None = None
@@ -101,6 +136,12 @@ class Vehicle:
     gnss: Antenna | None = None
     positions: tuple[PositionStream, ...] = ()
     heights: tuple[HeightStream, ...] = ()
+    velocities: tuple[VelocityStream, ...] = ()
+    attitudes: tuple[AttitudeStream, ...] = ()
+    magnetics: tuple[MagneticStream, ...] = ()
+    constraints: Constraints = Constraints()
+    imu_calibration: ImuCalibration = ImuCalibration()
+    carrier: str | None = None
     motion: MotionPrior = MotionPrior()
     fixed_n: Vec3 | None = None
     truth: Truth | None = None
@@ -126,7 +167,12 @@ class RangeModel:
     stream: RangeStream
     bias_sigma_m: float = 0.0  # prior; 0: not estimated
     scale_sigma: float = 0.0
-    per_pair: bool = False
+    per_pair: bool = False  # of tags
+    lever_sigma_m: float = 0.0  # prior of every carried tag's lever arm
+    time_sigma_s: float = 0.0  # prior of a time offset of the whole set
+
+    def __post_init__(self) -> None:
+        not_negative(self, "bias_sigma_m", "scale_sigma", "lever_sigma_m", "time_sigma_s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +227,11 @@ class Settings:
             "range": Robust("cauchy", 2.0),
             "position": Robust("huber", 2.0),
             "height": Robust("huber", 2.0),
+            "velocity": Robust("huber", 2.0),
+            "attitude": Robust("huber", 2.0),
+            "magnetic": Robust("huber", 2.0),
+            "bearing": Robust("huber", 2.0),
+            "constraint": Robust("huber", 2.0),
         }
     )
     max_iterations: int = 50
@@ -198,6 +249,7 @@ class NavigationProblem:
     vehicles: tuple[Vehicle, ...]
     links: tuple[Link, ...] = ()
     ranges: tuple[RangeModel, ...] = ()
+    visions: tuple[VisionStream, ...] = ()
     pairs: tuple[Link, ...] = ()  # pairs whose relative solution is wanted; empty: every link, else every pair
     settings: Settings = field(default_factory=Settings)
 
@@ -210,10 +262,16 @@ class NavigationProblem:
             for end in (link.reference, link.rover):
                 if end not in names:
                     raise InputError(f"link {link.reference}-{link.rover}: no vehicle named {end}; there are {', '.join(names)}")
-        for model in self.ranges:
-            for tag in model.stream.tags:
-                if tag.vehicle is not None and tag.vehicle not in names:
-                    raise InputError(f"tag {tag.name}: no vehicle named {tag.vehicle}; there are {', '.join(names)}")
+        for v in self.vehicles:
+            if v.carrier is not None and (v.carrier not in names or self.vehicle(v.carrier).carrier is not None):
+                raise InputError(
+                    f"vehicle {v.name}: its carrier {v.carrier} is no vehicle with states; there are {', '.join(names)}"
+                )
+        tags = [tag for model in self.ranges for tag in model.stream.tags]
+        tags += [tag for vision in self.visions for tag in (vision.observer, vision.target)]
+        for tag in tags:
+            if tag.vehicle is not None and tag.vehicle not in names:
+                raise InputError(f"tag {tag.name}: no vehicle named {tag.vehicle}; there are {', '.join(names)}")
 
     def vehicle(self, name: str) -> Vehicle:
         return next(v for v in self.vehicles if v.name == name)

@@ -30,7 +30,7 @@ import numpy as np
 from numba import njit
 
 from ambiguity import DoubleDifferences, follow
-from factorgraph.errors import InputError
+from factorgraph.errors import InputError, not_negative, positive
 from factorgraph.filters import adaptive, kalman
 from factorgraph.filters.adaptive import Statistic
 from factorgraph.filters.layout import Layout
@@ -38,7 +38,6 @@ from factorgraph.filters.motion import constant_acceleration
 from factorgraph.models import double_differences as dd
 from factorgraph.models.double_differences import PairEpochs
 from factorgraph.models.robust import bifactor, igg3
-from factorgraph.problem import not_negative, positive
 from factorgraph.types import Array, IntArray
 
 MOTION = Layout(baseline=3, velocity=3, acceleration=3)

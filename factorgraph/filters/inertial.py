@@ -22,14 +22,13 @@ import numpy as np
 from numba import njit
 
 from factorgraph.attitude import quat_from_matrix
-from factorgraph.errors import InputError
+from factorgraph.errors import InputError, not_negative, positive
 from factorgraph.filters.discretise import discretise, gauss_markov_density
 from factorgraph.filters.layout import Layout
 from factorgraph.geodesy import LocalFrame
 from factorgraph.measurements import ImuStream
 from factorgraph.models.preintegration import sample_means
 from factorgraph.models.strapdown import gravity_into, propagate_into, quat_exp, quat_mul
-from factorgraph.problem import not_negative, positive
 from factorgraph.types import Array
 
 LONGEST_GAP_S = 1.0  # of an IMU that a filter bridges with the mean of the samples around

@@ -21,13 +21,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph.attitude import skew
-from factorgraph.errors import InputError
+from factorgraph.errors import InputError, not_negative, positive
 from factorgraph.filters import kalman
 from factorgraph.filters.inertial import ATT, INERTIAL, NAVIGATION, POS, SENSORS, VEL, ImuModel, InertialStart, Navigator
 from factorgraph.geodesy import LocalFrame
 from factorgraph.models.gnss import elevation_scale
 from factorgraph.models.receivers import Receiver
-from factorgraph.problem import not_negative, positive
 from factorgraph.types import Array, BoolArray, IntArray
 
 STATES = INERTIAL.extended(clock=1, drift=1)

@@ -29,7 +29,7 @@ from numba import njit
 
 import ambiguity
 from factorgraph.attitude import skew
-from factorgraph.errors import InputError
+from factorgraph.errors import InputError, positive
 from factorgraph.filters import adaptive, kalman, tightly_coupled
 from factorgraph.filters.adaptive import Statistic
 from factorgraph.filters.float_ambiguity import (
@@ -46,7 +46,7 @@ from factorgraph.models import double_differences as dd
 from factorgraph.models.double_differences import PairEpochs, pair_epochs
 from factorgraph.models.receivers import receivers
 from factorgraph.models.robust import bifactor
-from factorgraph.problem import NavigationProblem, positive
+from factorgraph.problem import NavigationProblem
 from factorgraph.types import Array, BoolArray, IntArray
 
 MOVING = slice(POS.start, VEL.stop)

@@ -26,8 +26,11 @@ from factorgraph.models.robust import weight as robust_weight
 from factorgraph.problem import RangeModel, Robust
 from factorgraph.types import Array, BoolArray, IntArray
 
-KINDS = ("code", "phase", "doppler", "range", "position", "height")
-CODE, PHASE, DOPPLER, RANGE, POSITION, HEIGHT = range(len(KINDS))
+KINDS = (
+    *("code", "phase", "doppler", "range", "position", "height"),
+    *("velocity", "attitude", "magnetic", "bearing", "constraint"),
+)
+CODE, PHASE, DOPPLER, RANGE, POSITION, HEIGHT, VELOCITY, ATTITUDE, MAGNETIC, BEARING, CONSTRAINT = range(len(KINDS))
 
 
 @dataclass(slots=True)
