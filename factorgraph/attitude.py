@@ -36,6 +36,31 @@ def exp_so3(phi: Array) -> Array:
     return np.asarray(np.eye(3) + s * S + c * (S @ S))
 
 
+def right_jacobian(phi: Array) -> Array:
+    """Jr (..., 3, 3) of rotation vectors (..., 3): Exp(phi + d) = Exp(phi) Exp(Jr d) to first order."""
+    phi = np.asarray(phi, float)
+    a2 = np.sum(phi * phi, axis=-1)[..., None, None]
+    a = np.sqrt(a2)
+    small = a < 1e-4
+    a_safe = np.where(small, 1.0, a)
+    b = np.where(small, 0.5 - a2 / 24, (1 - np.cos(a_safe)) / a_safe**2)
+    c = np.where(small, 1 / 6 - a2 / 120, (a_safe - np.sin(a_safe)) / a_safe**3)
+    S = skew(phi)
+    return np.asarray(np.eye(3) - b * S + c * (S @ S))
+
+
+def right_jacobian_inverse(phi: Array) -> Array:
+    """Inverse of `right_jacobian` (..., 3, 3), for rotation vectors up to pi: Log(Exp(phi) Exp(d)) = phi + Jr^-1 d."""
+    phi = np.asarray(phi, float)
+    a2 = np.sum(phi * phi, axis=-1)[..., None, None]
+    a = np.sqrt(a2)
+    small = a < 1e-3
+    a_safe = np.where(small, 1.0, a)
+    c = np.where(small, 1 / 12 + a2 / 720, 1 / a_safe**2 - 0.5 / (a_safe * np.tan(a_safe / 2)))
+    S = skew(phi)
+    return np.asarray(np.eye(3) + 0.5 * S + c * (S @ S))
+
+
 def log_so3(C: Array) -> Array:
     """Rotation vector (..., 3), norm in [0, pi], of rotation matrices (..., 3, 3)."""
     q = quat_from_matrix(C)

@@ -107,6 +107,23 @@ class ResidualTable:
 
 
 @dataclass(frozen=True, slots=True)
+class ParameterEstimate:
+    """A constant estimated beside the states: posterior and prior. A ratio of sigmas near 1: the data do not tell it."""
+
+    name: str  # "follower/gnss lever arm x"
+    unit: str
+    value: float
+    sigma: float
+    prior: float
+    prior_sigma: float
+
+    @property
+    def is_told(self) -> bool:
+        """Whether the data tell it at least twice as well as the prior does."""
+        return self.sigma < 0.5 * self.prior_sigma
+
+
+@dataclass(frozen=True, slots=True)
 class Diagnostics:
     """How the solution came about."""
 
@@ -119,7 +136,7 @@ class Diagnostics:
     nis_dof: Array = field(default_factory=lambda: np.zeros(0))  # effective degrees of freedom per epoch
     warnings: tuple[str, ...] = ()  # anything that makes the result degraded: printed, exit status 1
     notes: tuple[str, ...] = ()
-    parameters: dict[str, tuple[float, float]] = field(default_factory=dict)  # e.g. range bias: value, sigma
+    parameters: tuple[ParameterEstimate, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,6 +33,7 @@ FIX_ROUNDS = 8
 CORRECTED_M = 1e-4  # change of a correction that is worth another solution
 ROUGH = 1e-3  # tolerance between rounds; only the last solution needs the settings' own
 FIRST = 3e-2  # tolerance before the first biases are known
+OFFSET_S = 1e-4  # change of a time offset that asks for it too
 REBIAS = np.array([3e-3, 3e-3, 3e-3, 0.1, 0.1, 0.1])  # bias change that asks for preintegrating again
 
 
@@ -158,22 +159,26 @@ class Batch:
         return self._continue(problem, graph, result, clock, settings.tolerance), ratio
 
     def _settle(self, problem: NavigationProblem, graph: Graph, clock: _Clock) -> Result:
-        """Optimise, preintegrating again while the biases move away from those preintegrated at."""
+        """Optimise, preintegrating again while biases and time offsets move away from those preintegrated at."""
         graph.assemble()
         costs: list[float] = []
-        for turn in range(5):
+        taken = graph.parameters.offsets_s()
+        for turn in range(6):
             tolerance = ROUGH if turn else FIRST
             result = optimise(graph, problem.settings.robust, problem.settings.max_iterations, tolerance, clock.iteration)
             costs += result.costs
-            moved = [
-                v
-                for v in graph.vehicles
-                if v.mode == "imu" and np.any(np.abs(v.bias - v.preintegrated_bias).max(axis=0) > REBIAS)
-            ]
-            if turn and (not moved or result.status is not Status.CONVERGED):
+            biased = any(
+                v.mode == "imu" and np.any(np.abs(v.bias - v.preintegrated_bias).max(axis=0) > REBIAS) for v in graph.vehicles
+            )
+            offsets = graph.parameters.offsets_s()
+            stale = biased or bool(np.any(np.abs(offsets - taken) > OFFSET_S))
+            if turn and (not stale or result.status is not Status.CONVERGED):
                 break
-            if not moved:
+            if not stale:
                 continue
+            taken = offsets
+            for v in graph.vehicles:
+                v.apply_imu_offset()
             native_factors(graph)
             for block in graph.blocks:
                 block.refresh()

@@ -13,17 +13,19 @@ from __future__ import annotations
 import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
 from numba import njit
 
+from factorgraph.attitude import skew
+from factorgraph.graphs.parameters import Parameter
 from factorgraph.graphs.variables import Point, Query, VehicleVariables
 from factorgraph.models.differencing import CommonGroups
 from factorgraph.models.robust import cost as robust_cost
 from factorgraph.models.robust import weight as robust_weight
-from factorgraph.problem import RangeModel, Robust
+from factorgraph.problem import Robust
 from factorgraph.types import Array, BoolArray, IntArray
 
 KINDS = (
@@ -189,117 +191,259 @@ class Block(ABC):
 
 
 @dataclass(slots=True)
+class Offset:
+    """A time offset to be estimated: observed at the query's time + sign * value, `applied_s` of it in the query already."""
+
+    parameter: Parameter
+    sign: float
+    applied_s: float = 0.0
+
+
+@dataclass(slots=True)
 class Endpoint:
-    """One end of an observation: a vehicle's point, with its columns."""
+    """One end of an observation: a vehicle's point, with its columns.
+
+    The columns of the vehicle's state are followed by those of the lever arm (3) and of each time offset (1), where they are
+    estimated. With the IMU's own offset a point belongs to the IMU's clock, which is ahead by what is not yet applied to it.
+    """
 
     vehicle: VehicleVariables
     query: Query
+    lever: Parameter | None = None  # correction of the lever arm, body frame
+    offsets: list[Offset] = field(default_factory=list)
 
     @property
     def width(self) -> int:
         return sum(self.dims)
 
     @property
-    def dims(self) -> tuple[int, ...]:
+    def state_dims(self) -> tuple[int, ...]:
         dims = self.vehicle.dims
         return dims[:2] if self.vehicle.mode == "imu" and self.query.increments is None else dims
 
-    def keys(self, row: int) -> tuple[int, ...]:
-        return self.vehicle.keys(int(self.query.k[row]))[: len(self.dims)]
+    @property
+    def dims(self) -> tuple[int, ...]:
+        return (*self.state_dims, *(len(p.value) for p in self.parameters))
 
-    def refresh(self) -> None:
-        self.query = self.vehicle.refresh(self.query)
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        imu = self.vehicle.imu_offset
+        return (
+            *((self.lever,) if self.lever is not None else ()),
+            *(offset.parameter for offset in self.offsets),
+            *((imu,) if imu is not None else ()),
+        )
+
+    def keys(self, row: int) -> tuple[int, ...]:
+        return (*self.vehicle.keys(int(self.query.k[row]))[: len(self.state_dims)], *(p.key for p in self.parameters))
+
+    def identities(self) -> list[tuple[str, int]]:
+        """What tells the columns' variables of one row apart from those of another end."""
+        states = [("state", 10 * self.vehicle.index + i) for i in range(len(self.state_dims))]
+        return [*states, *(("parameter", p.key) for p in self.parameters)]
+
+    def ahead(self) -> list[tuple[float, float]]:
+        """Sign and part not yet applied [s] of each time offset, in the order of their columns."""
+        ahead_s = [(o.sign, o.sign * float(o.parameter.value[0]) - o.applied_s) for o in self.offsets]
+        if self.vehicle.imu_offset is not None:
+            ahead_s.append((1.0, float(self.vehicle.imu_offset.value[0]) - self.vehicle.imu_applied_s))
+        return ahead_s
+
+    def points(self, velocity: bool = True) -> Point:
+        """The observed points with the columns of states and parameters."""
+        q, v = self.query, self.vehicle
+        if not self.parameters:
+            return v.points(q, velocity)
+        if self.lever is not None:
+            q = replace(q, lever_b=q.lever_b + self.lever.value)
+        ahead_s = self.ahead()
+        p = v.points(q, velocity or bool(ahead_s))
+        r, vel, J_r, J_v = p.r_n, p.v_n, [p.J_r], [p.J_v]
+        if self.lever is not None:
+            rate = v.body_rate(v.t_s[q.k] + q.dt_s, q.k)
+            J_r.append(p.R)
+            J_v.append(p.R @ skew(rate))
+        if ahead_s:
+            a = v.acceleration(q, p)
+            late = sum(dt for _, dt in ahead_s)
+            r, vel = r + vel * late + 0.5 * a * late**2, vel + a * late
+            J_r = [J + late * rate for J, rate in zip(J_r, J_v, strict=True)]
+            for sign, _ in ahead_s:
+                J_r.append(sign * vel[:, :, None])
+                J_v.append(sign * a[:, :, None])
+        return Point(r, vel, np.concatenate(J_r, axis=2), np.concatenate(J_v, axis=2), p.R)
+
+    def refresh(self) -> bool:
+        """Renew the increments, at the current time offsets; tells whether points now belong to other states."""
+        step = 0.0
+        for o in self.offsets:
+            now = o.sign * float(o.parameter.value[0])
+            step, o.applied_s = step + now - o.applied_s, now
+        if step == 0.0:
+            self.query = self.vehicle.refresh(self.query)
+            return False
+        before, had = self.query.k, self.query.increments is None
+        self.query = self.vehicle.query(self.vehicle.t_s[before] + self.query.dt_s + step, self.query.lever_b)
+        return had != (self.query.increments is None) or bool(np.any(self.query.k != before))
+
+
+class Columns:
+    """Columns of a block with several ends: those of one end after those of another, what they share only once."""
+
+    def __init__(self, ends: Sequence[Endpoint], more: Sequence[Parameter] = ()) -> None:
+        self.ends, self.more = tuple(ends), tuple(more)
+        self._slots: list[tuple[int, int]] = []  # end and position of every key
+        known: dict[tuple[str, int], int] = {}
+        dims: list[int] = []
+        slot_of: list[list[int]] = []
+        for e, end in enumerate(self.ends):
+            slot_of.append([])
+            for i, (identity, d) in enumerate(zip(end.identities(), end.dims, strict=True)):
+                if identity not in known:
+                    known[identity] = len(dims)
+                    dims.append(d)
+                    self._slots.append((e, i))
+                slot_of[-1].append(known[identity])
+        edges = np.cumsum([0, *dims])
+        self._at = [
+            np.concatenate([np.arange(edges[s], edges[s + 1]) for s in slots] or [np.zeros(0, np.int64)]) for slots in slot_of
+        ]
+        self._width = int(edges[-1])
+        self.dims = (*dims, *(len(p.value) for p in self.more))
+        self.shared = self._width < sum(end.width for end in self.ends)
+
+    def keys(self, row: int) -> list[int]:
+        of_end = [end.keys(row) for end in self.ends]
+        return [*(of_end[e][i] for e, i in self._slots), *(p.key for p in self.more)]
+
+    def join(self, parts: Sequence[Array], more: Sequence[Array] = ()) -> Array:
+        """Jacobian (n, w) from one part per end (n, w_e) and one per further parameter (n, d)."""
+        if not self.shared:
+            return np.hstack([*parts, *more])
+        J = np.zeros((len(parts[0]), self._width))
+        for at, part in zip(self._at, parts, strict=True):
+            J[:, at] += part
+        return np.hstack([J, *more])
 
 
 @dataclass(slots=True)
-class PositionBlock(Block):
+class EndsBlock(Block):
+    """A block whose columns are those of its ends and of parameters; factors with several rows are those of one interval."""
+
+    columns_of: Columns = field(init=False)
+
+    def ends(self) -> list[Endpoint]:
+        """The ends, in the order of the columns."""
+        raise NotImplementedError
+
+    def parameters(self) -> list[Parameter]:
+        """Parameters besides those of the ends."""
+        return []
+
+    def __post_init__(self) -> None:
+        Block.__post_init__(self)
+        self.columns_of = Columns(self.ends(), self.parameters())
+
+    def keys(self, f: int) -> list[int]:
+        return self.columns_of.keys(self._entry(f))
+
+    def _entry(self, f: int) -> int:
+        """Query entry of factor f."""
+        return int(self.rows.factor.start[f])
+
+    def widths(self) -> tuple[int, ...]:
+        return self.columns_of.dims
+
+    def regroup(self) -> None:
+        """Sort rows into factors again after their points moved to other states: the rows of one interval share a factor."""
+        interval = np.zeros(self.n, np.int64)
+        for end in self.ends():
+            interval = interval * len(end.vehicle.t_s) + end.query.k
+        self.rows.factor = CommonGroups.from_labels(interval)
+
+    def refresh(self) -> None:
+        if any([end.refresh() for end in self.ends()]):
+            self.regroup()
+            self.columns_of = Columns(self.ends(), self.parameters())
+            self.made = None
+
+
+@dataclass(slots=True)
+class PositionBlock(EndsBlock):
     """Position fixes: three rows per fix, r_antenna - z."""
 
     end: Endpoint
     z_n: Array  # (m, 3)
 
-    def keys(self, f: int) -> list[int]:
-        return list(self.end.keys(f))
+    def ends(self) -> list[Endpoint]:
+        return [self.end]
 
-    def widths(self) -> tuple[int, ...]:
-        return self.end.dims
+    def _entry(self, f: int) -> int:
+        return f
+
+    def regroup(self) -> None:
+        """A factor per fix, whatever its state."""
 
     def predict(self) -> None:
-        p = self.end.vehicle.points(self.end.query, velocity=False)
+        p = self.end.points(velocity=False)
         self.y = (self.z_n - p.r_n).ravel()
         self.J = p.J_r.reshape(self.n, -1)
 
-    def refresh(self) -> None:
-        self.end.refresh()
-
 
 @dataclass(slots=True)
-class HeightBlock(Block):
-    """Up coordinates of a point: the rows of one state interval share a factor."""
+class HeightBlock(EndsBlock):
+    """Up coordinates of a point, with a bias where one is estimated."""
 
     end: Endpoint
     z_m: Array  # (n,)
+    bias: Parameter | None = None
 
-    def keys(self, f: int) -> list[int]:
-        return list(self.end.keys(int(self.rows.factor.start[f])))
+    def ends(self) -> list[Endpoint]:
+        return [self.end]
 
-    def widths(self) -> tuple[int, ...]:
-        return self.end.dims
+    def parameters(self) -> list[Parameter]:
+        return [] if self.bias is None else [self.bias]
 
     def predict(self) -> None:
-        p = self.end.vehicle.points(self.end.query, velocity=False)
-        self.y = self.z_m - p.r_n[:, 2]
-        self.J = p.J_r[:, 2, :]
-
-    def refresh(self) -> None:
-        self.end.refresh()
+        p = self.end.points(velocity=False)
+        bias = 0.0 if self.bias is None else self.bias.value[0]
+        self.y = self.z_m - p.r_n[:, 2] - bias
+        self.J = self.columns_of.join([p.J_r[:, 2, :]], [] if self.bias is None else [np.ones((self.n, 1))])
 
 
 @dataclass(slots=True)
-class RangeBlock(Block):
-    """Ranges between two points: z = (1 + scale) |a - b| + bias. The rows of one state interval share a factor.
+class RangeBlock(EndsBlock):
+    """Ranges between two points: z = (1 + scale) |a - b| + bias.
 
-    `a` is on a vehicle; `b` on another vehicle or fixed. Bias and scale are one two-element variable `parameter`.
+    `a` is on a vehicle; `b` on another vehicle or fixed. Bias and scale are one two-element parameter.
     """
 
     a: Endpoint
     b: Endpoint | None
     anchor_n: Array | None  # (n, 3) when b is None
     z_m: Array  # (n,)
-    parameter: int | None  # key, or None when neither is estimated
-    model: RangeModel
-    value: Array = field(default_factory=lambda: np.zeros(2))  # bias [m], scale [1]
+    parameter: Parameter | None  # None when neither is estimated
 
-    def keys(self, f: int) -> list[int]:
-        row = int(self.rows.factor.start[f])
-        own = [*self.a.keys(row), *(self.b.keys(row) if self.b is not None else ())]
-        return own if self.parameter is None else [*own, self.parameter]
+    def ends(self) -> list[Endpoint]:
+        return [self.a] if self.b is None else [self.a, self.b]
 
-    def widths(self) -> tuple[int, ...]:
-        own = (*self.a.dims, *(self.b.dims if self.b is not None else ()))
-        return own if self.parameter is None else (*own, 2)
+    def parameters(self) -> list[Parameter]:
+        return [] if self.parameter is None else [self.parameter]
 
     def predict(self) -> None:
-        pa = self.a.vehicle.points(self.a.query, velocity=False)
+        pa = self.a.points(velocity=False)
         if self.b is not None:
-            pb = self.b.vehicle.points(self.b.query, velocity=False)
+            pb = self.b.points(velocity=False)
             d, others = pa.r_n - pb.r_n, [-pb.J_r]
         else:
             assert self.anchor_n is not None
             d, others = pa.r_n - self.anchor_n, []
         rho = np.maximum(np.linalg.norm(d, axis=1), 1e-6)
         e = d / rho[:, None]
-        scale = 1 + self.value[1]
-        self.y = self.z_m - scale * rho - self.value[0]
-        J = [scale * np.einsum("ni,niw->nw", e, part) for part in (pa.J_r, *others)]
-        if self.parameter is not None:
-            J.append(np.column_stack([np.ones(self.n), rho]))
-        self.J = np.hstack(J)
-
-    def refresh(self) -> None:
-        self.a.refresh()
-        if self.b is not None:
-            self.b.refresh()
+        bias, scale = (0.0, 0.0) if self.parameter is None else self.parameter.value
+        self.y = self.z_m - (1 + scale) * rho - bias
+        J = [(1 + scale) * np.einsum("ni,niw->nw", e, part) for part in (pa.J_r, *others)]
+        self.J = self.columns_of.join(J, [] if self.parameter is None else [np.column_stack([np.ones(self.n), rho])])
 
 
 @dataclass(slots=True)
@@ -446,7 +590,7 @@ def project_entries(c: ScalarColumns, u: Array, clocks: CommonGroups, factor: Co
 
 
 @dataclass(slots=True)
-class GnssBlock(Block):
+class GnssBlock(EndsBlock):
     """Code, phase and Doppler of a receiver, or their differences rover - reference. One factor per epoch.
 
     Predicted (common clocks projected out): |s - a_rover| - |s' - a_ref| for code and phase (+ lambda N), and
@@ -477,18 +621,17 @@ class GnssBlock(Block):
     scalar_columns: ScalarColumns | None = None  # until factors are renewed
 
     def __post_init__(self) -> None:
-        Block.__post_init__(self)
+        EndsBlock.__post_init__(self)
         self.iono, self.iono_scale = np.full(self.n, -1, np.int64), np.zeros(self.n)
 
-    def _ends(self) -> list[Endpoint]:
+    def ends(self) -> list[Endpoint]:
         return [self.rover] if self.reference is None else [self.rover, self.reference]
 
     def keys(self, f: int) -> list[int]:
-        own = [k for end in self._ends() for k in end.keys(f)]
-        return [*own, *self.scalars(f)]
+        return [*self.columns_of.keys(f), *self.scalars(f)]
 
-    def widths(self) -> tuple[int, ...]:
-        return tuple(d for end in self._ends() for d in end.dims)
+    def regroup(self) -> None:
+        """A factor per epoch, whatever its states."""
 
     def scalars(self, f: int) -> list[int]:
         """Keys of the ambiguities and ionospheres of factor f that are variables."""
@@ -542,18 +685,18 @@ class GnssBlock(Block):
 
     def predict(self) -> None:
         has_rate = bool(np.any(self.rows.kind == DOPPLER))
-        rover = self.rover.vehicle.points(self.rover.query, velocity=has_rate)
+        rover = self.rover.points(velocity=has_rate)
         if self.reference is None:
             y, by_r, e = self._one_way(rover.r_n, rover.v_n, self.sat_rover, self.vel_rover)
-            self.J = self._jacobian(by_r, e, rover)
+            self.J = self.columns_of.join([self._jacobian(by_r, e, rover)])
         else:
-            reference = self.reference.vehicle.points(self.reference.query, velocity=has_rate)
+            reference = self.reference.points(velocity=has_rate)
             at = reference.r_n if self.place_n is None else self.place_n
             y, by_r, e = self._one_way(at + (rover.r_n - reference.r_n), rover.v_n, self.sat_rover, self.vel_rover)
             y_ref, by_r_ref, e_ref = self._one_way(at, reference.v_n, self.sat_reference, self.vel_reference)
             y -= y_ref
             by_r_ref = by_r_ref if self.place_n is None else by_r
-            self.J = np.hstack([self._jacobian(by_r, e, rover), -self._jacobian(by_r_ref, e_ref, reference)])
+            self.J = self.columns_of.join([self._jacobian(by_r, e, rover), -self._jacobian(by_r_ref, e_ref, reference)])
         phase = self.arc >= 0
         y[phase] += self.wavelength_m[phase] * self.amb_value[self.arc[phase]]
         if len(self.iono_value):
@@ -578,7 +721,3 @@ class GnssBlock(Block):
     def columns(self, f: int) -> list[Array]:
         matrix = self._entries().matrix(f)
         return [*Block.columns(self, f), *(matrix[:, k : k + 1] for k in range(matrix.shape[1]))]
-
-    def refresh(self) -> None:
-        for end in self._ends():
-            end.refresh()

@@ -7,7 +7,7 @@ code of the reference and differences carry everything once.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -27,13 +27,17 @@ from factorgraph.graphs.blocks import (
     IonosphereBlock,
     JointBlock,
     MotionBlock,
+    Offset,
     PositionBlock,
     RangeBlock,
     Rows,
 )
 from factorgraph.graphs.inertial import add_imu_factors, add_priors, motion_keys, motion_prior_rows
 from factorgraph.graphs.optimizer import Graph
+from factorgraph.graphs.parameters import Parameter, Parameters
+from factorgraph.graphs.rows import in_grid, plain_rows, sensor_end, time_offset
 from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.measurements import Tag
 from factorgraph.models.arcs import Arcs, find_arcs
 from factorgraph.models.differencing import CommonGroups
 from factorgraph.models.gnss import (
@@ -51,6 +55,7 @@ from factorgraph.types import Array, BoolArray, IntArray
 
 HEADING_SIGMA_RAD = 3.0
 HINT_SIGMA_RAD = 0.3
+HELD = 1e-6  # prior of a component that is not estimated beside one that is
 
 
 @dataclass(slots=True)
@@ -111,6 +116,7 @@ def link_block(
     rx: dict[str, Receiver],
     key_base: int,
     use_phase: bool,
+    parameters: Parameters,
 ) -> GnssLink:
     """Differences rover - reference of code, phase and Doppler. Raises InputError when the two share nothing."""
     ref, rov = rx[link.reference], rx[link.rover]
@@ -145,8 +151,8 @@ def link_block(
     )
     arc_row = np.full(len(row), -1, np.int64)
     arc_row[kind == PHASE] = np.unique(arc[row][kind == PHASE], return_inverse=True)[1]
-    rover = Endpoint(ends[link.rover], ends[link.rover].query(t_rover, rov.lever_b))
-    reference = Endpoint(ends[link.reference], ends[link.reference].query(t_ref, ref.lever_b))
+    rover = antenna_end(ends[link.rover], t_rover, rov, parameters)
+    reference = antenna_end(ends[link.reference], t_ref, ref, parameters)
     block = GnssBlock(
         rows,
         rover=rover,
@@ -165,6 +171,11 @@ def link_block(
     data = GnssLink(link, block, ra, rb, none.astype(np.int64), [], [], none, none, slips=arcs.slips, key_base=key_base)
     describe_arcs(data)
     return data
+
+
+def antenna_end(end: VehicleVariables, t: Array, rx: Receiver, parameters: Parameters) -> Endpoint:
+    """Where a receiver observes."""
+    return sensor_end(end, t, rx.lever_b, f"{rx.vehicle.name}/gnss", rx.antenna.calibration, parameters)
 
 
 def _nothing_shared(link: Link, a: Antenna, b: Antenna, have_rows: bool) -> str:
@@ -266,7 +277,9 @@ def describe_arcs(data: GnssLink) -> None:
     data.state = ["float"] * n
 
 
-def absolute_block(problem: NavigationProblem, end: VehicleVariables, rx: Receiver) -> GnssBlock | None:
+def absolute_block(
+    problem: NavigationProblem, end: VehicleVariables, rx: Receiver, parameters: Parameters
+) -> GnssBlock | None:
     """Undifferenced code (one signal per satellite) and Doppler of a moving receiver."""
     antenna = rx.antenna
     stream, noise = antenna.stream, antenna.noise
@@ -309,7 +322,7 @@ def absolute_block(problem: NavigationProblem, end: VehicleVariables, rx: Receiv
     zero = np.zeros((len(row), 3))
     return GnssBlock(
         table,
-        rover=Endpoint(end, end.query(times, antenna.lever_b)),
+        rover=antenna_end(end, times, rx, parameters),
         reference=None,
         point_rover=factor_of,
         z=z,
@@ -322,40 +335,15 @@ def absolute_block(problem: NavigationProblem, end: VehicleVariables, rx: Receiv
     )
 
 
-def _plain_rows(
-    kind: int, t: Array, sigma: Array, factor: IntArray, source: str, label: list[str], label_index: IntArray
-) -> Rows:
-    nothing = np.full(len(t), np.nan)
-    zeros = np.zeros(len(t), np.int64)
-    return Rows(
-        np.full(len(t), kind),
-        t,
-        sigma,
-        CommonGroups.from_labels(factor),
-        None,
-        source,
-        label,
-        label_index,
-        [""],
-        zeros,
-        nothing,
-        nothing,
-    )
-
-
-def _in_grid(t: Array, grid: Array) -> BoolArray:
-    return np.asarray((t >= grid[0] - 1e-6) & (t <= grid[-1] + 1e-6))
-
-
-def position_blocks(end: VehicleVariables) -> list[Block]:
+def position_blocks(end: VehicleVariables, parameters: Parameters) -> list[Block]:
     """Position fixes and heights of a vehicle."""
     vehicle = end.vehicle
     blocks: list[Block] = []
     for p in vehicle.positions:
-        ok = _in_grid(p.t_s, end.t_s) & np.all(np.isfinite(p.r_n), axis=1) & end.is_carried(p.t_s)
+        ok = in_grid(p.t_s, end.t_s, p.calibration.time_s) & np.all(np.isfinite(p.r_n), axis=1) & end.is_carried(p.t_s)
         n = int(ok.sum())
         if n:
-            rows = _plain_rows(
+            rows = plain_rows(
                 POSITION,
                 np.repeat(p.t_s[ok], 3),
                 p.sigma_m[ok].ravel(),
@@ -364,69 +352,89 @@ def position_blocks(end: VehicleVariables) -> list[Block]:
                 ["E", "N", "U"],
                 np.tile(np.arange(3), n),
             )
-            blocks.append(PositionBlock(rows, end=Endpoint(end, end.query(p.t_s[ok], p.lever_b)), z_n=p.r_n[ok]))
+            at = sensor_end(end, p.t_s[ok], p.lever_b, f"{vehicle.name}/{p.name}", p.calibration, parameters)
+            blocks.append(PositionBlock(rows, end=at, z_n=p.r_n[ok]))
     for h in vehicle.heights:
-        ok = _in_grid(h.t_s, end.t_s) & np.isfinite(h.up_m) & end.is_carried(h.t_s)
+        ok = in_grid(h.t_s, end.t_s, h.calibration.time_s) & np.isfinite(h.up_m) & end.is_carried(h.t_s)
         n = int(ok.sum())
         if n:
-            query = end.query(h.t_s[ok], h.lever_b)
-            rows = _plain_rows(
-                HEIGHT, h.t_s[ok], h.sigma_m[ok], query.k, f"{vehicle.name}/{h.name}", ["U"], np.zeros(n, np.int64)
-            )
-            blocks.append(HeightBlock(rows, end=Endpoint(end, query), z_m=h.up_m[ok]))
+            name = f"{vehicle.name}/{h.name}"
+            at = sensor_end(end, h.t_s[ok], h.lever_b, name, h.calibration, parameters)
+            rows = plain_rows(HEIGHT, h.t_s[ok], h.sigma_m[ok], at.query.k, name, ["U"], np.zeros(n, np.int64))
+            bias = parameters.scalar(f"{name} bias", "m", h.calibration.bias)
+            blocks.append(HeightBlock(rows, end=at, z_m=h.up_m[ok], bias=bias))
     return blocks
 
 
-def range_blocks(model: RangeModel, ends: dict[str, VehicleVariables], first_parameter: int) -> list[RangeBlock]:
-    """A block per pair of carriers (vehicle-vehicle or vehicle-anchor); parameters per block or one for the set."""
+def range_blocks(model: RangeModel, ends: dict[str, VehicleVariables], parameters: Parameters) -> list[RangeBlock]:
+    """A block per pair of carriers (vehicle-vehicle or vehicle-anchor), per pair of tags where these have parameters."""
     stream = model.stream
     tags = stream.tags
     blocks: list[RangeBlock] = []
-    estimated = model.bias_sigma_m > 0 or model.scale_sigma > 0
+    by_tag = model.per_pair or model.lever_sigma_m > 0
     carrier = np.array([tag.vehicle or "" for tag in tags])
     grid = next(iter(ends.values())).t_s
     # the first end is always on a vehicle
     swap = carrier[stream.tag_a] == ""
     a, b = np.where(swap, stream.tag_b, stream.tag_a), np.where(swap, stream.tag_a, stream.tag_b)
-    ok = _in_grid(stream.t_s, grid) & np.isfinite(stream.range_m) & (carrier[a] != carrier[b])
+    ok = in_grid(stream.t_s, grid, model.time_sigma_s) & np.isfinite(stream.range_m) & (carrier[a] != carrier[b])
     lever = np.array([tag.lever_b for tag in tags])
     anchor = np.array([tag.position_n or (np.nan,) * 3 for tag in tags])
-    pair = np.char.add(np.char.add(carrier[a], "\n"), carrier[b])
+    name_of = np.array([tag.name for tag in tags]) if by_tag else carrier
+    first, second = np.minimum(a, b) if by_tag else a, np.maximum(a, b) if by_tag else b
+    pair = np.char.add(np.char.add(name_of[first], "\n"), name_of[second])
     for name, end in ends.items():
         ok &= ((carrier[a] != name) & (carrier[b] != name)) | end.is_carried(stream.t_s)
     for name in np.unique(pair[ok]):
         rows = np.flatnonzero(ok & (pair == name))
-        va, vb = str(name).split("\n")
+        va, vb = str(carrier[a[rows[0]]]), str(carrier[b[rows[0]]])
+        if by_tag:  # both directions of a pair of tags
+            flip = a[rows] != a[rows[0]]
+            ta, tb = np.where(flip, b[rows], a[rows]), np.where(flip, a[rows], b[rows])
+        else:
+            ta, tb = a[rows], b[rows]
         t = stream.t_s[rows]
-        labels, index = np.unique(
-            [f"{tags[i].name}-{tags[j].name}" for i, j in zip(a[rows], b[rows], strict=True)], return_inverse=True
-        )
-        query = ends[va].query(t, lever[a[rows]])
-        other = Endpoint(ends[vb], ends[vb].query(t, lever[b[rows]])) if vb else None
-        interval = query.k if other is None else query.k * len(grid) + other.query.k
+        labels, index = np.unique([f"{tags[i].name}-{tags[j].name}" for i, j in zip(ta, tb, strict=True)], return_inverse=True)
+        offset = time_offset(parameters.scalar(f"{stream.name} time offset", "s", model.time_sigma_s))
+        tag_end = _ranged(ends[va], t, lever[ta], tags[ta[0]], model, parameters, offset)
+        other = _ranged(ends[vb], t, lever[tb], tags[tb[0]], model, parameters, offset) if vb else None
+        interval = tag_end.query.k if other is None else tag_end.query.k * len(grid) + other.query.k
         source = f"{stream.name} {va}-{vb or 'anchors'}"
-        table = _plain_rows(RANGE, t, stream.sigma_m[rows], interval, source, [str(s) for s in labels], index)
-        parameter = None
-        if estimated:
-            parameter = int(gtsam.symbol("s", first_parameter + (len(blocks) if model.per_pair else 0)))
+        what = f"{stream.name} {tags[ta[0]].name}-{tags[tb[0]].name}" if model.per_pair else stream.name
         blocks.append(
             RangeBlock(
-                table,
-                a=Endpoint(ends[va], query),
+                plain_rows(RANGE, t, stream.sigma_m[rows], interval, source, [str(s) for s in labels], index),
+                a=tag_end,
                 b=other,
-                anchor_n=None if other is not None else anchor[b[rows]],
+                anchor_n=None if other is not None else anchor[tb],
                 z_m=stream.range_m[rows],
-                parameter=parameter,
-                model=model,
+                parameter=_range_parameter(model, what, parameters),
             )
         )
     return blocks
 
 
+def _range_parameter(model: RangeModel, what: str, parameters: Parameters) -> Parameter | None:
+    """Bias and scale of ranges; what is not estimated is held by its prior."""
+    if model.bias_sigma_m == 0 and model.scale_sigma == 0:
+        return None
+    sigma = np.array([max(model.bias_sigma_m, HELD), max(model.scale_sigma, 1e-3 * HELD)])
+    return parameters.add(what, ("bias", "scale"), "m", np.zeros(2), sigma)
+
+
+def _ranged(
+    end: VehicleVariables, t: Array, lever: Array, tag: Tag, model: RangeModel, parameters: Parameters, offset: list[Offset]
+) -> Endpoint:
+    """One end of ranges: a tag carried by a vehicle."""
+    correction = parameters.vector(f"{model.stream.name} {tag.name} lever arm", "m", model.lever_sigma_m)
+    lever_of = correction if end.mode == "imu" else None
+    return Endpoint(end, end.query(t, lever), lever_of, [replace(o) for o in offset])
+
+
 def motion_block(vehicle: VehicleVariables) -> MotionBlock:
     L, J = motion_prior_rows(vehicle)
     n = len(L)
-    rows = _plain_rows(
+    rows = plain_rows(
         -1,
         np.repeat(vehicle.t_s[1:], 6),
         np.ones(6 * n),
@@ -441,7 +449,7 @@ def motion_block(vehicle: VehicleVariables) -> MotionBlock:
 def joint_block(a: VehicleVariables, b: VehicleVariables) -> JointBlock:
     """Rows without information that keep two vehicles' states of one time in one clique, so that their covariance is at hand."""
     n = len(a.t_s)
-    rows = _plain_rows(-1, a.t_s, np.ones(n), np.arange(n), f"{a.name}-{b.name}", ["joint"], np.zeros(n, np.int64))
+    rows = plain_rows(-1, a.t_s, np.ones(n), np.arange(n), f"{a.name}-{b.name}", ["joint"], np.zeros(n, np.int64))
     return JointBlock(rows, a=a, b=b)
 
 
@@ -471,7 +479,7 @@ def add_ionosphere(problem: NavigationProblem, data: GnssLink, baseline_m: float
     gap_s = np.concatenate([[0], np.diff(at)]) * settings.ionosphere_step_s
     sigmas = np.where(follows, sigma * np.sqrt(np.maximum(gap_s, 1.0) / settings.ionosphere_correlation_s), sigma)
     n = len(used)
-    table = _plain_rows(
+    table = plain_rows(
         -1,
         rows.t_s[0] + at * settings.ionosphere_step_s,
         sigmas,
@@ -500,13 +508,7 @@ def native_factors(graph: Graph) -> None:
         if v.mode == "imu":
             add_imu_factors(graph.native, v)
         add_priors(graph.native, v, HINT_SIGMA_RAD if v.vehicle.heading_hint_rad is not None else HEADING_SIGMA_RAD)
-    seen = set()
-    for block in graph.ranges:
-        model = block.model
-        if block.parameter is not None and block.parameter not in seen:
-            seen.add(block.parameter)
-            sigmas = np.array([max(model.bias_sigma_m, 1e-6), max(model.scale_sigma, 1e-9)])
-            graph.native.add(gtsam.PriorFactorVector(block.parameter, np.zeros(2), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+    graph.native.push_back(graph.parameters.priors())
 
 
 def build(
@@ -519,13 +521,16 @@ def build(
     """All blocks and native factors for variables that already hold start values."""
     ends = {v.name: v for v in vehicles}
     graph = Graph(vehicles, [], gtsam.NonlinearFactorGraph())
+    for end in vehicles:
+        if end.mode == "imu":
+            end.imu_offset = graph.parameters.scalar(f"{end.name}/imu time offset", "s", end.vehicle.imu_calibration.time_s)
     links: list[GnssLink] = []
     rovers = {link.rover for link in problem.links}
     key_base = 0
     absolute: list[Block] = []
     for link in problem.links:
         if link.reference in rx and link.rover in rx:
-            data = link_block(problem, link, ends, rx, key_base, use_phase)
+            data = link_block(problem, link, ends, rx, key_base, use_phase, graph.parameters)
             key_base += 1_000_000
             links.append(data)
             graph.gnss.append(data.block)
@@ -535,21 +540,21 @@ def build(
                 absolute.append(ionosphere)
     for v in problem.vehicles:
         if v.name in rx and v.name not in rovers and not v.is_fixed and problem.settings.use_absolute and not v.positions:
-            block = absolute_block(problem, ends[v.name], rx[v.name])
+            block = absolute_block(problem, ends[v.name], rx[v.name], graph.parameters)
             if block is not None:
                 absolute.append(block)
-    for i, model in enumerate(problem.ranges):
-        graph.ranges += range_blocks(model, ends, i * 10_000)
     others: list[Block] = []
+    for model in problem.ranges:
+        others += range_blocks(model, ends, graph.parameters)
     for end in vehicles:
-        others += position_blocks(end)
+        others += position_blocks(end, graph.parameters)
         if end.mode == "motion":
             others.append(motion_block(end))
     for pair in problem.wanted_pairs:
         both = [ends[pair.reference], ends[pair.rover]]
         if all(end.mode != "fixed" for end in both):
             graph.joints.append(joint_block(both[0], both[1]))
-    graph.blocks = [*graph.gnss, *absolute, *graph.ranges, *others]
+    graph.blocks = [*graph.gnss, *absolute, *others]
     progress(0.5)
     native_factors(graph)
     progress(1.0)

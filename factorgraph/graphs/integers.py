@@ -15,7 +15,8 @@ import numpy as np
 from ambiguity import partial
 from factorgraph.graphs.blocks import CODE, PHASE, GnssBlock
 from factorgraph.graphs.build import GnssLink, describe_arcs
-from factorgraph.graphs.optimizer import Graph
+from factorgraph.graphs.optimizer import DIMENSION, Graph
+from factorgraph.graphs.parameters import LETTERS
 from factorgraph.models.arcs import split_at_steps
 from factorgraph.problem import AmbiguitySettings
 from factorgraph.types import Array, IntArray
@@ -107,7 +108,7 @@ def tail_covariance(net: gtsam.GaussianBayesNet, keys: list[int]) -> Array:
     tail = []
     for i in range(n - 1, -1, -1):
         c = net.at(i)
-        if chr(gtsam.symbolChr(c.keys()[0])) not in "as":
+        if chr(gtsam.symbolChr(c.keys()[0])) not in ("a", *LETTERS.values()):
             break
         tail.append(c)
     tail.reverse()
@@ -123,7 +124,7 @@ def tail_covariance(net: gtsam.GaussianBayesNet, keys: list[int]) -> Array:
         R[i : i + d, i : i + d] = c.R()
         S, col = c.S(), 0
         for p in parents:
-            width = 2 if chr(gtsam.symbolChr(p)) == "s" else 1
+            width = DIMENSION[chr(gtsam.symbolChr(p))]
             R[i : i + d, index[p] : index[p] + width] = S[:, col : col + width]
             col += width
     Ri = np.linalg.inv(R)

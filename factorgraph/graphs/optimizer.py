@@ -2,7 +2,7 @@
 
 GTSAM linearises and eliminates; the loop, the robust weights, the damping and the convergence test are here, because a
 C++ optimizer copies all values into every Python factor call. One iteration: evaluate blocks, reweight, linearise,
-eliminate in COLAMD order with ambiguities and range parameters last, step; a step that raises the robust cost is undone
+eliminate in COLAMD order with ambiguities and parameters last, step; a step that raises the robust cost is undone
 and the damping raised.
 """
 
@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from factorgraph.graphs.blocks import Block, GnssBlock, RangeBlock
+from factorgraph.graphs.blocks import Block, GnssBlock
+from factorgraph.graphs.parameters import Parameters
 from factorgraph.graphs.variables import ValueTable, VehicleVariables
 from factorgraph.problem import Robust
 from factorgraph.solution import Status
@@ -22,7 +23,7 @@ from factorgraph.types import Array, IntArray
 
 LAMBDA_START, LAMBDA_MAX = 1e-4, 1e8
 PIVOT_MIN = 1e-13  # relative to its row
-DIMENSION = {"x": 6, "b": 6, "p": 3, "v": 3, "a": 1, "i": 1, "s": 2}  # of a variable, by the letter of its key
+DIMENSION = {"x": 6, "b": 6, "p": 3, "v": 3, "a": 1, "i": 1, "c": 1, "s": 2, "l": 3}  # of a variable, by the letter of its key
 
 
 @dataclass(slots=True)
@@ -42,7 +43,7 @@ class Graph:
     blocks: list[Block]
     native: gtsam.NonlinearFactorGraph
     gnss: list[GnssBlock] = field(default_factory=list)
-    ranges: list[RangeBlock] = field(default_factory=list)
+    parameters: Parameters = field(default_factory=Parameters)
     joints: list[Block] = field(default_factory=list)  # only for covariances: what is to share a clique
     values: gtsam.Values = field(default_factory=gtsam.Values)
     graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
@@ -69,11 +70,10 @@ class Graph:
             mine = np.array([int(k) in used for k in gnss.amb_key], bool)
             _put(self.values, gnss.amb_key[mine], gnss.amb_value[mine])
         self.last = sorted(used)
-        for ranges in self.ranges:
-            if ranges.parameter is not None and ranges.parameter not in self.last:
-                if not self.values.exists(ranges.parameter):
-                    self.values.insert(ranges.parameter, ranges.value.copy())
-                self.last.append(ranges.parameter)
+        for parameter in self.parameters:
+            if not self.values.exists(parameter.key):
+                self.values.insert(parameter.key, parameter.value.copy())
+            self.last.append(parameter.key)
 
     def take(self, values: gtsam.Values) -> None:
         """Make `values` current and evaluate every block there."""
@@ -87,9 +87,8 @@ class Graph:
                     gnss.amb_value[i] = values.atVector(int(k))[0]
             for i, k in enumerate(gnss.iono_key):
                 gnss.iono_value[i] = values.atVector(int(k))[0]
-        for ranges in self.ranges:
-            if ranges.parameter is not None:
-                ranges.value = values.atVector(ranges.parameter)
+        for parameter in self.parameters:
+            parameter.value = values.atVector(parameter.key)
         for block in self.blocks:
             block.predict()
 
@@ -113,7 +112,7 @@ class Graph:
         return eliminate(linear, self.ordering(linear))
 
     def ordering(self, linear: gtsam.GaussianFactorGraph) -> gtsam.Ordering:
-        """COLAMD with ambiguities and range parameters last."""
+        """COLAMD with ambiguities and parameters last."""
         if self.last:
             return gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, self.last)
         return gtsam.Ordering.ColamdGaussianFactorGraph(linear)

@@ -6,6 +6,7 @@ dimension: `c` 1, `s` 2, `l` 3.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import gtsam
@@ -43,7 +44,7 @@ class Parameters:
             self.of_name[name] = Parameter(key, name, components, unit, prior, sigma, prior.copy())
         return self.of_name[name]
 
-    def __iter__(self):  # type: ignore[no-untyped-def]
+    def __iter__(self) -> Iterator[Parameter]:
         return iter(self.of_name.values())
 
     def scalar(self, name: str, unit: str, sigma: float, prior: float = 0.0) -> Parameter | None:
@@ -53,6 +54,10 @@ class Parameters:
     def vector(self, name: str, unit: str, sigma: float) -> Parameter | None:
         """Three components x, y, z with zero mean, None where `sigma` is 0."""
         return self.add(name, ("x", "y", "z"), unit, np.zeros(3), np.full(3, sigma)) if sigma > 0 else None
+
+    def offsets_s(self) -> Array:
+        """Current time offsets (m,)."""
+        return np.array([p.value[0] for p in self.of_name.values() if p.unit == "s"])
 
     def priors(self) -> gtsam.NonlinearFactorGraph:
         """One prior factor per parameter."""

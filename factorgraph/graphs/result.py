@@ -11,7 +11,7 @@ import numpy as np
 
 from factorgraph.attitude import quat_from_matrix
 from factorgraph.graphs.blocks import CODE, KINDS, Block, GnssBlock, IonosphereBlock, JointBlock, MotionBlock
-from factorgraph.graphs.build import Built, GnssLink
+from factorgraph.graphs.build import HELD, Built, GnssLink
 from factorgraph.graphs.covariance import JointCovariance
 from factorgraph.graphs.integers import tail_covariance
 from factorgraph.graphs.optimizer import Graph, Result
@@ -28,6 +28,7 @@ from factorgraph.solution import (
     Diagnostics,
     Fix,
     PairSolution,
+    ParameterEstimate,
     ResidualTable,
     Solution,
     Status,
@@ -372,18 +373,17 @@ def _nis(graph: Graph, cov: JointCovariance | None) -> tuple[Array, Array, Array
     return t[seen], total[seen], dof[seen]
 
 
-def _parameters(graph: Graph, cov: JointCovariance | None) -> dict[str, tuple[float, float]]:
-    out: dict[str, tuple[float, float]] = {}
-    for block in graph.ranges:
-        if block.parameter is None:
-            continue
-        sigma = np.sqrt(np.diag(cov.joint([block.parameter]))) if cov is not None else np.full(2, np.nan)
-        name = block.rows.source if block.model.per_pair else block.model.stream.name
-        if block.model.bias_sigma_m > 0:
-            out[f"{name} bias [m]"] = (float(block.value[0]), float(sigma[0]))
-        if block.model.scale_sigma > 0:
-            out[f"{name} scale [1]"] = (float(block.value[1]), float(sigma[1]))
-    return out
+def _parameters(graph: Graph, cov: JointCovariance | None) -> tuple[ParameterEstimate, ...]:
+    """Every estimated constant with its prior; components that their prior holds are left out."""
+    out = []
+    for p in graph.parameters:
+        sigma = np.sqrt(np.diag(cov.joint([p.key]))) if cov is not None else np.full(len(p.value), np.nan)
+        for i, component in enumerate(p.components):
+            if p.sigma[i] > HELD:
+                name, unit = f"{p.name} {component}".strip(), "1" if component == "scale" else p.unit
+                values = (p.value[i], sigma[i], p.prior[i], p.sigma[i])
+                out.append(ParameterEstimate(name, unit, *(float(x) for x in values)))
+    return tuple(out)
 
 
 def _warnings(

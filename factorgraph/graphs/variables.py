@@ -14,14 +14,15 @@ Perturbation as GTSAM's Pose3: R Exp(dtheta), r + R drho.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import gtsam
 import numpy as np
 
-from factorgraph.attitude import exp_so3, skew
+from factorgraph.attitude import exp_so3, right_jacobian, skew
 from factorgraph.geodesy import LocalFrame, centrifugal_ecef
+from factorgraph.graphs.parameters import Parameter
 from factorgraph.grid import MERGE_S
 from factorgraph.measurements import ImuStream
 from factorgraph.models import preintegration
@@ -61,6 +62,7 @@ class Point:
     v_n: Array  # (n, 3)
     J_r: Array  # (n, 3, w)
     J_v: Array  # (n, 3, w)
+    R: Array  # (n, 3, 3) attitude; unit matrices without one
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,12 +105,22 @@ class VehicleVariables:
         self.preintegrated_bias = np.zeros((K, 6))
         letters = {"imu": "xvb", "motion": "pv", "fixed": ""}[self.mode]
         self._keys = [tuple(key(letter, index, k) for letter in letters) for k in range(K)]
+        self.imu_offset: Parameter | None = None  # of the IMU's time tags, where it is estimated
+        self.imu_applied_s = 0.0  # what of it the stream in use is free of
+        self._imu = self.vehicle.imu
         self.gaps_s = preintegration.gaps(self.imu) if self.mode == "imu" else np.zeros((0, 2))
 
     @property
     def imu(self) -> ImuStream:
-        assert self.vehicle.imu is not None
-        return self.vehicle.imu
+        assert self._imu is not None
+        return self._imu
+
+    def apply_imu_offset(self) -> None:
+        """Take the current estimate of the IMU's time offset out of its stream."""
+        if self.imu_offset is not None and self.vehicle.imu is not None:
+            self.imu_applied_s = float(self.imu_offset.value[0])
+            self._imu = replace(self.vehicle.imu, t_s=self.vehicle.imu.t_s - self.imu_applied_s)
+            self.gaps_s = preintegration.gaps(self.imu)
 
     def keys(self, k: int) -> tuple[int, ...]:
         """Keys of state k in the order of the local columns."""
@@ -173,13 +185,14 @@ class VehicleVariables:
         """Observed points at the current trajectory; without `velocity` v_n and J_v are left zero."""
         n = len(q.k)
         if self.mode == "fixed":
-            return Point(self.r[q.k], np.zeros((n, 3)), np.zeros((n, 3, 0)), np.zeros((n, 3, 0)))
+            nothing = np.zeros((n, 3, 0))
+            return Point(self.r[q.k], np.zeros((n, 3)), nothing, nothing, self.R[q.k])
         dt = q.dt_s[:, None]
         eye = np.broadcast_to(np.eye(3), (n, 3, 3))
         if self.mode == "motion":
             J_r, J_v = np.zeros((n, 3, 6)), np.zeros((n, 3, 6))
             J_r[:, :, :3], J_r[:, :, 3:], J_v[:, :, 3:] = eye, eye * dt[..., None], eye
-            return Point(self.r[q.k] + self.v[q.k] * dt, self.v[q.k], J_r, J_v)
+            return Point(self.r[q.k] + self.v[q.k] * dt, self.v[q.k], J_r, J_v, self.R[q.k])
         R, v = self.R[q.k], self.v[q.k]
         rate = self.body_rate(self.t_s[q.k] + q.dt_s, q.k)
         w_l = np.cross(rate, q.lever_b)
@@ -189,7 +202,7 @@ class VehicleVariables:
             J_r[:, :, :3], J_r[:, :, 3:6], J_r[:, :, 6:] = -R @ skew(q.lever_b), R, eye * dt[..., None]
             if velocity:
                 J_v[:, :, :3], J_v[:, :, 6:] = -R @ skew(w_l), eye
-            return Point(r, v + np.einsum("nij,nj->ni", R, w_l), J_r, J_v)
+            return Point(r, v + np.einsum("nij,nj->ni", R, w_l), J_r, J_v, R)
         inc = q.increments
         db = self.bias[q.k] - self.preintegrated_bias[q.k]
         # up to NEAR_S before its state no increments carry a point, so gravity alone must not: constant velocity and rate
@@ -206,13 +219,39 @@ class VehicleVariables:
         J_r[:, :, 9:12] = R @ inc.dp_dba
         J_r[:, :, 12:15] = R @ inc.dp_dbg - Rt @ skew(q.lever_b) @ inc.dR_dbg
         if not velocity:
-            return Point(r, np.zeros((n, 3)), J_r, J_v)
+            return Point(r, np.zeros((n, 3)), J_r, J_v, Rt)
         dv = inc.dv + np.einsum("nij,nj->ni", inc.dv_dbg, db[:, :3]) + np.einsum("nij,nj->ni", inc.dv_dba, db[:, 3:])
         vel = v + g * ahead + np.einsum("nij,nj->ni", R, dv) + np.einsum("nij,nj->ni", Rt, w_l)
         J_v[:, :, :3], J_v[:, :, 6:9] = -R @ skew(dv + np.einsum("nij,nj->ni", dR, w_l)), eye
         J_v[:, :, 9:12] = R @ inc.dv_dba
         J_v[:, :, 12:15] = R @ inc.dv_dbg - Rt @ skew(w_l) @ inc.dR_dbg + Rt @ skew(q.lever_b)
-        return Point(r, vel, J_r, J_v)
+        return Point(r, vel, J_r, J_v, Rt)
+
+    def frames(self, q: Query) -> tuple[Array, Array]:
+        """Attitude C_nb (n, 3, 3) at a query's times, and its Jacobian (n, 3, w): R_t Exp(J dx) for local columns dx.
+
+        For vehicles with an IMU.
+        """
+        n = len(q.k)
+        rate = self.body_rate(self.t_s[q.k] + q.dt_s, q.k)
+        if q.increments is None:
+            J = np.zeros((n, 3, 9))
+            J[:, :, :3] = np.eye(3)
+            return self.R[q.k] @ exp_so3(rate * q.dt_s[:, None]), J
+        db = self.bias[q.k] - self.preintegrated_bias[q.k]
+        phi = np.einsum("nij,nj->ni", q.increments.dR_dbg, db[:, :3])
+        dR = q.increments.dR @ exp_so3(phi + rate * np.minimum(q.dt_s, 0.0)[:, None])
+        J = np.zeros((n, 3, 15))
+        J[:, :, :3], J[:, :, 12:15] = np.swapaxes(dR, 1, 2), right_jacobian(phi) @ q.increments.dR_dbg
+        return exp_so3(-self.frame.w_ie_n * np.maximum(q.dt_s, 0.0)[:, None]) @ self.R[q.k] @ dR, J
+
+    def acceleration(self, q: Query, p: Point) -> Array:
+        """Acceleration of the body in n (n, 3) at observed points, from the accelerometer; zeros without IMU."""
+        if self.mode != "imu":
+            return np.zeros((len(q.k), 3))
+        i = np.clip(np.searchsorted(self.imu.t_s, self.t_s[q.k] + q.dt_s), 0, len(self.imu.t_s) - 1)
+        f_b = self.imu.f_b[i] - self.bias[q.k, 3:]
+        return np.asarray(np.einsum("nij,nj->ni", p.R, f_b) + self.gravity_terms(q.k))
 
     def insert(self, values: gtsam.Values) -> None:
         """Put the current trajectory into GTSAM values."""

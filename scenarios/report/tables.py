@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from factorgraph.solution import AmbiguityTable, ResidualTable, Solution
+from factorgraph.solution import AmbiguityTable, ParameterEstimate, ResidualTable, Solution
 from scenarios.metrics import ErrorSeries, SummaryRow, statistics, summary_rows
 from scenarios.report.chart import UNITS
 from scenarios.report.series import normalised
@@ -112,10 +112,17 @@ def outliers(found: ResidualTable) -> str:
     return paragraph(f"{shown} outliers among {len(found.t_s):,} residuals.") + table(head, rows, 3)
 
 
-def parameters(found: dict[str, tuple[float, float]]) -> str:
-    """Estimated constants with their standard deviations."""
-    rows = [[name, number(value, 6), number(sigma, 3)] for name, (value, sigma) in found.items()]
-    return table(("parameter", "estimate", "σ"), rows)
+def parameters(found: Sequence[ParameterEstimate]) -> str:
+    """Estimated constants with their standard deviations beside their priors."""
+    rows = [
+        [p.name, number(p.value, 6), number(p.sigma, 3), number(p.prior, 6), number(p.prior_sigma, 3), p.unit, _told(p)]
+        for p in found
+    ]
+    return table(("parameter", "estimate", "σ", "prior", "prior σ", "unit", "observed"), rows)
+
+
+def _told(p: ParameterEstimate) -> str:
+    return "yes" if p.is_told else "no: the data hardly tell it"
 
 
 def configuration(solution: Solution) -> str:

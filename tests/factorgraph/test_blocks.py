@@ -15,7 +15,7 @@ import pytest
 from factorgraph.attitude import exp_so3
 from factorgraph.gpstime import GpsTime
 from factorgraph.graphs import integers
-from factorgraph.graphs.blocks import PHASE, Block, GnssBlock, IonosphereBlock, RangeBlock
+from factorgraph.graphs.blocks import PHASE, Block, GnssBlock, IonosphereBlock, PositionBlock
 from factorgraph.graphs.build import (
     GnssLink,
     absolute_block,
@@ -27,11 +27,12 @@ from factorgraph.graphs.build import (
     range_blocks,
 )
 from factorgraph.graphs.optimizer import Graph
+from factorgraph.graphs.parameters import Parameters
 from factorgraph.graphs.variables import VehicleVariables, key
-from factorgraph.measurements import GnssStream, HeightStream, ImuStream, PositionStream, RangeStream, Tag
+from factorgraph.measurements import Calibration, GnssStream, HeightStream, ImuStream, PositionStream, RangeStream, Tag
 from factorgraph.models.differencing import CommonGroups
 from factorgraph.models.receivers import receivers
-from factorgraph.problem import AmbiguitySettings, Antenna, Link, NavigationProblem, RangeModel, Settings, Vehicle
+from factorgraph.problem import AmbiguitySettings, Antenna, ImuCalibration, Link, NavigationProblem, RangeModel, Settings, Vehicle
 from factorgraph.types import Array
 from tests.factorgraph.synthetic import FRAME, every, receiver
 
@@ -47,8 +48,10 @@ STEP = {
     "a": (1.0,),
     "i": (1.0,),
     "s": (0.01,),
+    "l": (0.1,),
+    "c": (1e-3,),
 }  # halves of the columns
-GNSS_STEP = STEP | {"x": (3e-3, 10.0), "p": (10.0,), "v": (1.0,)}
+GNSS_STEP = STEP | {"x": (3e-3, 10.0), "p": (10.0,), "v": (1.0,), "l": (1.0,), "c": (0.03,)}
 # left out of Jacobians on purpose: the Earth's rate times the time since the state, second order in bias changes
 CARRIED = 1e-3
 MODES = ("imu", "motion", "fixed")
@@ -100,10 +103,12 @@ def problem_of(modes: tuple[str, str], offset_s: float = 0.0) -> tuple[Navigatio
     return problem, {v.name: variables(i, v) for i, v in enumerate(vehicles)}
 
 
-def evaluated(ends: dict[str, VehicleVariables], blocks: list[Block], seed: int = 0) -> Graph:
+def evaluated(
+    ends: dict[str, VehicleVariables], blocks: list[Block], parameters: Parameters | None = None, seed: int = 0
+) -> Graph:
     """A graph of these blocks at its values, with robust weights that differ from row to row."""
-    gnss, ranges = [b for b in blocks if isinstance(b, GnssBlock)], [b for b in blocks if isinstance(b, RangeBlock)]
-    graph = Graph(list(ends.values()), blocks, gtsam.NonlinearFactorGraph(), gnss, ranges)
+    gnss = [b for b in blocks if isinstance(b, GnssBlock)]
+    graph = Graph(list(ends.values()), blocks, gtsam.NonlinearFactorGraph(), gnss, parameters or Parameters())
     graph.assemble()
     graph.take(graph.values)
     rng = np.random.default_rng(seed)
@@ -150,7 +155,7 @@ def assert_jacobians(graph: Graph, block: Block, steps: dict[str, tuple[float, .
 
 
 def link_of(problem: NavigationProblem, ends: dict[str, VehicleVariables]) -> GnssLink:
-    data = link_block(problem, problem.links[0], ends, receivers(problem), 0, use_phase=True)
+    data = link_block(problem, problem.links[0], ends, receivers(problem), 0, True, Parameters())
     integers.start_ambiguities(data)
     return data
 
@@ -175,7 +180,7 @@ def test_differences_of_code_phase_and_doppler(modes: tuple[str, str], offset_s:
 @pytest.mark.parametrize("offset_s", [0.0, 0.4])
 def test_undifferenced_code_and_doppler(mode: str, offset_s: float) -> None:
     problem, ends = problem_of(("fixed", mode), offset_s)
-    block = absolute_block(problem, ends["b"], receivers(problem)["b"])
+    block = absolute_block(problem, ends["b"], receivers(problem)["b"], Parameters())
     assert block is not None
     assert_jacobians(evaluated(ends, [block]), block, GNSS_STEP, CARRIED)
 
@@ -196,7 +201,7 @@ def test_ionosphere_of_a_long_link() -> None:
 @pytest.mark.parametrize("offset_s", [0.0, 0.4])
 def test_positions_and_heights(mode: str, offset_s: float) -> None:
     _, ends = problem_of(("fixed", mode), offset_s)
-    position, height = position_blocks(ends["b"])
+    position, height = position_blocks(ends["b"], Parameters())
     graph = evaluated(ends, [position, height])
     assert position.n == 12 and height.n == 9
     for block in (position, height):
@@ -224,11 +229,93 @@ def test_ranges_with_bias_and_scale(modes: tuple[str, str], anchors: bool) -> No
     """Both ends with lever arms, between states; the anchor named first is still the far end."""
     _, ends = problem_of(modes)
     t = np.sort(np.random.default_rng(1).uniform(0, 4, 12))
-    (block,) = range_blocks(ranges_between(t, anchors), ends, 0)
-    block.value[:] = [0.2, 0.03]
-    graph = evaluated(ends, [block])
+    parameters = Parameters()
+    (block,) = range_blocks(ranges_between(t, anchors), ends, parameters)
+    assert block.parameter is not None
+    block.parameter.value[:] = [0.2, 0.03]
+    graph = evaluated(ends, [block], parameters)
     assert block.n == 12 and gtsam.symbolChr(block.keys(0)[-1]) == ord("s")
     assert_jacobians(graph, block, STEP, CARRIED)
+
+
+# -- lever arms and time offsets --------------------------------------------------------------------
+
+
+def calibrated(v: Vehicle) -> Vehicle:
+    """The vehicle with everything about its sensors' places and clocks to be estimated."""
+    every_one = Calibration(lever_m=0.5, time_s=0.05)
+    return replace(
+        v,
+        gnss=replace(v.gnss, calibration=every_one) if v.gnss else None,
+        positions=tuple(replace(p, calibration=every_one) for p in v.positions),
+        heights=tuple(replace(h, calibration=Calibration(time_s=0.05, bias=1.0)) for h in v.heights),
+        imu_calibration=ImuCalibration(time_s=0.05),
+    )
+
+
+def calibrated_problem(offset_s: float) -> tuple[NavigationProblem, dict[str, VehicleVariables], Parameters]:
+    """Two vehicles with IMU and an estimated time offset of it, values away from zero."""
+    problem, _ = problem_of(("imu", "imu"), offset_s)
+    problem = replace(problem, vehicles=tuple(calibrated(v) for v in problem.vehicles))
+    ends = {v.name: variables(i, v) for i, v in enumerate(problem.vehicles)}
+    parameters = Parameters()
+    for end in ends.values():
+        end.imu_offset = parameters.scalar(f"{end.name} imu", "s", 0.05)
+    return problem, ends, parameters
+
+
+def assert_calibration_jacobians(
+    ends: dict[str, VehicleVariables], block: Block, parameters: Parameters, steps: dict[str, tuple[float, ...]], letters: str
+) -> None:
+    rng = np.random.default_rng(4)
+    for p in parameters:
+        p.value = rng.normal(0, 0.3 if p.unit == "m" else 0.002, len(p.value))
+    graph = evaluated(ends, [block], parameters)
+    assert set(letters) <= {chr(gtsam.symbolChr(k)) for k in block.keys(0)}
+    # second order, left out: what a late time changes of the columns of attitude and bias
+    assert_jacobians(graph, block, steps, 2e-2)
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 0.4])
+def test_levers_and_time_offsets_of_differences(offset_s: float) -> None:
+    problem, ends, parameters = calibrated_problem(offset_s)
+    data = link_block(problem, problem.links[0], ends, receivers(problem), 0, True, parameters)
+    assert_calibration_jacobians(ends, data.block, parameters, GNSS_STEP, "xvlc")
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 0.4])
+def test_levers_and_time_offsets_of_positions_and_heights(offset_s: float) -> None:
+    _, ends, parameters = calibrated_problem(offset_s)
+    position, height = position_blocks(ends["b"], parameters)
+    assert_calibration_jacobians(ends, position, parameters, STEP, "xvlc")
+    assert_calibration_jacobians(ends, height, parameters, STEP, "xvc")
+
+
+def test_levers_and_one_time_offset_of_ranges() -> None:
+    """Both ends share the set's time offset: its column is one."""
+    _, ends, parameters = calibrated_problem(0.0)
+    t = np.sort(np.random.default_rng(1).uniform(0.5, 3.5, 12))
+    model = replace(ranges_between(t, False), lever_sigma_m=0.2, time_sigma_s=0.02, per_pair=True)
+    blocks = range_blocks(model, ends, parameters)
+    assert len(blocks) == 2 and blocks[0].parameter is not blocks[1].parameter
+    for block in blocks:
+        keys = block.keys(0)
+        assert len(set(keys)) == len(keys)
+        assert_calibration_jacobians(ends, block, parameters, STEP, "xvlcs")
+
+
+def test_points_move_to_other_states_with_a_time_offset() -> None:
+    """0.3 s late at 0.1 s after a state: the state before carries the fix, at the time it was taken."""
+    _, ends, parameters = calibrated_problem(0.1)
+    position, _ = position_blocks(ends["b"], parameters)
+    assert isinstance(position, PositionBlock)
+    before, keys = position.end.query.k.copy(), position.keys(2)
+    t = GRID[before] + position.end.query.dt_s
+    parameters.of_name["b/position time offset"].value[:] = 0.3
+    position.refresh()
+    after = position.end.query
+    np.testing.assert_allclose(GRID[after.k] + after.dt_s, t - 0.3, atol=1e-9)
+    assert np.all(after.k[1:] == before[1:] - 1) and position.keys(2) != keys
 
 
 def test_motion_prior() -> None:
@@ -243,9 +330,10 @@ def test_motion_prior() -> None:
 def test_factors_hand_out_the_blocks_rows() -> None:
     """What GTSAM linearises is what the block computed: errors, Jacobians and their keys."""
     problem, ends = problem_of(("imu", "imu"), 0.4)
-    (ranges,) = range_blocks(ranges_between(np.array([0.5, 1.5, 2.6]), False), ends, 0)
-    blocks: list[Block] = [link_of(problem, ends).block, ranges, *position_blocks(ends["b"])]
-    graph = evaluated(ends, blocks)
+    parameters = Parameters()
+    (ranges,) = range_blocks(ranges_between(np.array([0.5, 1.5, 2.6]), False), ends, parameters)
+    blocks: list[Block] = [link_of(problem, ends).block, ranges, *position_blocks(ends["b"], parameters)]
+    graph = evaluated(ends, blocks, parameters)
     linear = graph.graph.linearize(graph.values)
     assert abs(graph.graph.error(graph.values) - 0.5 * sum(float(b.e @ b.e) for b in blocks)) < 1e-9 * graph.graph.error(
         graph.values
@@ -360,7 +448,7 @@ def test_normalised_residual_of_an_outlier_is_its_own() -> None:
 
 def test_inactive_rows_count_nowhere() -> None:
     _, ends = problem_of(("fixed", "imu"))
-    position, _ = position_blocks(ends["b"])
+    position, _ = position_blocks(ends["b"], Parameters())
     evaluated(ends, [position])
     position.w = np.ones(position.n)
     all_of_it = position.cost({})

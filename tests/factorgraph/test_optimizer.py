@@ -8,10 +8,11 @@ import pytest
 from scipy.optimize import least_squares
 
 from factorgraph.graphs import optimizer
-from factorgraph.graphs.blocks import Block, RangeBlock
+from factorgraph.graphs.blocks import Block
 from factorgraph.graphs.build import motion_block, position_blocks, range_blocks
 from factorgraph.graphs.inertial import add_priors, motion_prior_rows
 from factorgraph.graphs.optimizer import Graph, Result, optimise
+from factorgraph.graphs.parameters import Parameters
 from factorgraph.graphs.variables import VehicleVariables, key
 from factorgraph.measurements import HeightStream, PositionStream, RangeStream, Tag
 from factorgraph.problem import MotionPrior, RangeModel, Robust, Vehicle
@@ -42,12 +43,12 @@ def ranging(model: RangeModel, start: Array) -> tuple[Graph, VehicleVariables]:
     """A vehicle with a motion prior and ranges, started at one point."""
     v = VehicleVariables(0, Vehicle("a", motion=MotionPrior((0.5, 0.5, 0.5))), T, FRAME)
     v.r[:] = start
-    ranges: list[RangeBlock] = range_blocks(model, {"a": v}, 0)
-    return graph_of(v, [*ranges, motion_block(v)], ranges), v
+    ranges = range_blocks(model, {"a": v}, Parameters())
+    return graph_of(v, [*ranges, motion_block(v)]), v
 
 
-def graph_of(v: VehicleVariables, blocks: list[Block], ranges: list[RangeBlock] | None = None) -> Graph:
-    graph = Graph([v], blocks, gtsam.NonlinearFactorGraph(), ranges=ranges or [])
+def graph_of(v: VehicleVariables, blocks: list[Block]) -> Graph:
+    graph = Graph([v], blocks, gtsam.NonlinearFactorGraph())
     graph.assemble()
     return graph
 
@@ -140,7 +141,7 @@ def test_gross_errors_lose_their_weight(kernel: str) -> None:
     assert rms(v) < (0.5 if kernel == "huber" else 0.25)
     true = np.linalg.norm(track(model.stream.t_s) - np.array(ANCHORS)[model.stream.tag_b - 1], axis=1)
     wrong = np.abs(model.stream.range_m - true) > 1.0
-    block = graph.ranges[0]
+    block = graph.blocks[0]
     assert wrong.sum() >= 3
     assert block.w[wrong].max() < 0.1 and np.median(block.w[~wrong]) > 0.7
 
@@ -151,7 +152,7 @@ def test_weights_belong_to_rows_not_to_factors() -> None:
     model.stream.range_m[7] += 25.0
     graph, _ = ranging(model, np.array([30.0, 20.0, 4.0]))
     run(graph, {"range": Robust("cauchy", 2.0)})
-    block = graph.ranges[0]
+    block = graph.blocks[0]
     neighbours = block.rows.factor.of_row == block.rows.factor.of_row[7]
     neighbours[7] = False
     assert block.w[7] < 0.01 and block.w[neighbours].min() > 0.3
@@ -164,7 +165,7 @@ def test_heights_alone_are_singular() -> None:
     """East and north have no information; the start stays where it is and nothing passes for a covariance."""
     v = VehicleVariables(0, Vehicle("a", heights=(HeightStream(T, 5 + 0.1 * np.sin(T), np.full(12, 0.3)),)), T, FRAME)
     v.v[:] = [1.0, 2.0, 0.3]
-    graph = graph_of(v, [*position_blocks(v), motion_block(v)])
+    graph = graph_of(v, [*position_blocks(v, Parameters()), motion_block(v)])
     result = run(graph)
     assert result.status is Status.SINGULAR and result.bayes_net is None and graph.covariance_net() is None
     assert np.abs(v.r).max() < 100.0
@@ -182,14 +183,14 @@ def test_one_range_per_state_is_singular() -> None:
     )
     v = VehicleVariables(0, Vehicle("a"), T, FRAME)
     v.r[:] = [20.0, 20.0, 3.0]
-    ranges = range_blocks(one, {"a": v}, 0)
-    assert run(graph_of(v, list(ranges), ranges)).status is Status.SINGULAR
+    ranges = range_blocks(one, {"a": v}, Parameters())
+    assert run(graph_of(v, list(ranges))).status is Status.SINGULAR
     np.testing.assert_allclose(np.linalg.norm(v.r, axis=1), one.stream.range_m, atol=1e-3)  # what can be had is had
 
 
 def test_weak_priors_make_it_regular() -> None:
     v = VehicleVariables(0, Vehicle("a", heights=(HeightStream(T, np.full(12, 5.0), np.full(12, 0.3)),)), T, FRAME)
-    graph = graph_of(v, [*position_blocks(v), motion_block(v)])
+    graph = graph_of(v, [*position_blocks(v, Parameters()), motion_block(v)])
     add_priors(graph.native, v, 1.0)
     graph.assemble()
     assert run(graph).status is Status.CONVERGED and graph.covariance_net() is not None
@@ -216,7 +217,7 @@ def test_a_linear_problem_takes_one_step_and_one_to_see_it() -> None:
     rng = np.random.default_rng(9)
     fixes = PositionStream(T, track(T) + rng.normal(0, 1, (12, 3)), np.ones((12, 3)))
     v = VehicleVariables(0, Vehicle("a", positions=(fixes,)), T, FRAME)
-    graph = graph_of(v, [*position_blocks(v), motion_block(v)])
+    graph = graph_of(v, [*position_blocks(v, Parameters()), motion_block(v)])
     result = run(graph)
     assert result.status is Status.CONVERGED and len(result.costs) == 3
     assert result.costs[1] - result.costs[2] < 1e-6

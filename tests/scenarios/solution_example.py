@@ -21,6 +21,7 @@ from factorgraph.solution import (
     Diagnostics,
     Fix,
     PairSolution,
+    ParameterEstimate,
     ResidualTable,
     Solution,
     Status,
@@ -212,5 +213,8 @@ def _diagnostics(t_s: Array, rng: np.random.Generator) -> Diagnostics:
         nis=rng.chisquare(dof),
         nis_dof=dof,
         notes=("3 arcs shorter than 5 epochs were left out",),
-        parameters={"uwb bias A1-B1 [m]": (0.123, 0.008), "uwb scale A1-B1": (1.0004, 0.0002)},
+        parameters=(
+            ParameterEstimate("uwb A1-B1 bias", "m", 0.123, 0.008, 0.0, 0.3),
+            ParameterEstimate("uwb A1-B1 scale", "1", 4e-4, 2e-4, 0.0, 3e-4),
+        ),
     )

@@ -24,6 +24,7 @@ from factorgraph.solution import (
     AmbiguityTable,
     Diagnostics,
     Fix,
+    ParameterEstimate,
     ResidualTable,
     Solution,
     Status,
@@ -241,7 +242,11 @@ def _hostile(s: Solution) -> Solution:
     table = replace(s.residuals, kind=("code" + HOSTILE, *s.residuals.kind[1:]), label=("G" + HOSTILE, *s.residuals.label[1:]))
     arcs = replace(s.ambiguities, link=tuple(name + HOSTILE for name in s.ambiguities.link))
     judged = replace(
-        s.diagnostics, warnings=(HOSTILE,), notes=(HOSTILE,), parameters={HOSTILE: (1.0, 0.1)}, runtime_s={HOSTILE: 1.0}
+        s.diagnostics,
+        warnings=(HOSTILE,),
+        notes=(HOSTILE,),
+        parameters=(ParameterEstimate(HOSTILE, HOSTILE, 1.0, 0.1, 0.0, 1.0),),
+        runtime_s={HOSTILE: 1.0},
     )
     return replace(
         s, name="flight" + HOSTILE, method=HOSTILE, vehicles=vehicles, pairs=(pair,), residuals=table, ambiguities=arcs,

@@ -16,7 +16,7 @@ import pytest
 
 from factorgraph.attitude import matrix_from_quat
 from factorgraph.errors import InputError
-from factorgraph.solution import Solution
+from factorgraph.solution import ParameterEstimate, Solution
 from scenarios import solutions, writers
 from scenarios.flights.rtklib_pos import read_pos
 from tests.scenarios.solution_example import example_solution, with_base
@@ -52,7 +52,9 @@ def test_a_solution_survives_the_disk_unchanged(solution: Solution, tmp_path: Pa
     odd = dataclasses.replace(
         solution,
         configuration={"x": [1, 2.5, None, True, {"y": float("inf")}], "τ": "m/s²"},
-        diagnostics=dataclasses.replace(solution.diagnostics, parameters={"bias": (0.1, float("nan"))}, warnings=("a", "b")),
+        diagnostics=dataclasses.replace(
+            solution.diagnostics, parameters=(ParameterEstimate("bias", "m", 0.1, float("nan"), 0.0, 1.0),), warnings=("a", "b")
+        ),
     )
     solutions.save(odd, tmp_path / "s")
     _assert_same(solutions.load(tmp_path / "s"), odd)
