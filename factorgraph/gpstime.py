@@ -64,6 +64,12 @@ class GpsTime:
         """The GPST calendar reading (microsecond resolution); tzinfo is UTC only formally."""
         return GPS_EPOCH + timedelta(weeks=self.week, seconds=self.sow)
 
+    @property
+    def day_of_year(self) -> float:
+        """Days since the year began, the first day counting from 1."""
+        when = self.calendar()
+        return when.timetuple().tm_yday + (self.sow % 86_400.0) / 86_400.0
+
     def utc(self) -> datetime:
         gpst = self.calendar()
         return gpst - timedelta(seconds=leap_seconds(gpst - timedelta(seconds=leap_seconds(gpst))))

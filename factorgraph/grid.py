@@ -24,11 +24,14 @@ def _own_times(problem: NavigationProblem, vehicle: Vehicle) -> Array:
             stream = model.stream
             mine = np.array([tag.vehicle == vehicle.name for tag in stream.tags])
             times.append(stream.t_s[mine[stream.tag_a] | mine[stream.tag_b]])
+        times += [s.t_s for s in problem.visions if s.target.vehicle == vehicle.name]
     return np.concatenate(times)
 
 
 def _all_times(problem: NavigationProblem, vehicle: Vehicle) -> Array:
     times = [_own_times(problem, vehicle), *(h.t_s for h in vehicle.heights)]
+    times += vehicle.motion_times
+    times += [s.t_s for s in problem.visions if vehicle.name in (s.observer.vehicle, s.target.vehicle)]
     for model in problem.ranges:
         mine = np.array([tag.vehicle == vehicle.name for tag in model.stream.tags])
         times.append(model.stream.t_s[mine[model.stream.tag_a] | mine[model.stream.tag_b]])
@@ -40,12 +43,12 @@ def common_grid(problem: NavigationProblem) -> Array:
 
     The span is where measurements are and every IMU runs. Raises InputError when there is no such span.
     """
-    moving = [v for v in problem.vehicles if not v.is_fixed]
+    moving = [v for v in problem.bodies if not v.is_fixed]
     if not moving:
         raise InputError("no vehicle moves: every vehicle has a fixed position")
-    measured = np.concatenate([_all_times(problem, v) for v in moving])
+    measured = np.concatenate([_all_times(problem, v) for v in problem.vehicles if not v.is_fixed])
     if not len(measured):
-        raise InputError("nothing to estimate from: no vehicle has GNSS, positions, heights or ranges")
+        raise InputError("nothing to estimate from: no vehicle has GNSS, positions, ranges or another sensor beside an IMU")
     first, last = float(measured.min()), float(measured.max())
     for v in moving:
         if v.imu is not None:
@@ -58,7 +61,7 @@ def common_grid(problem: NavigationProblem) -> Array:
             first, last = max(first, start), min(last, stop)
     if last - first < 1e-3:
         raise InputError(f"sensors overlap for only {max(last - first, 0):.3f} s: nothing to smooth")
-    own = np.unique(np.concatenate([_own_times(problem, v) for v in moving]))
+    own = np.unique(np.concatenate([_own_times(problem, v) for v in problem.vehicles if not v.is_fixed]))
     own = own[(own >= first - 1e-9) & (own <= last + 1e-9)]
     edges = own if len(own) else np.array([first])
     if edges[0] - first > MERGE_S:

@@ -35,12 +35,13 @@ from factorgraph.errors import InputError
 from factorgraph.geodesy import LocalFrame
 from factorgraph.measurements import ImuStream
 from factorgraph.models import preintegration
-from factorgraph.problem import NavigationProblem
+from factorgraph.problem import NavigationProblem, Vec3
 from factorgraph.solution import PairSolution, Solution, VehicleSolution
 from factorgraph.types import Array, BoolArray, IntArray
 
 Rate = float | Literal["imu"]  # Hz, or the times of the IMU
 CHUNK = 32_768  # times at once, which bounds memory
+RATE_STEP_S = 2e-3  # either side of a time, for how fast a lever arm turns
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +97,30 @@ def interpolate_pair(
     rover_imu: ImuStream | None,
     frame: LocalFrame,
     t_s: Array,
+    reference_lever_b: Vec3 = (0.0, 0.0, 0.0),
+    rover_lever_b: Vec3 = (0.0, 0.0, 0.0),
 ) -> PairTrajectory:
-    """Baseline and relative velocity at times t_s (n,). Raises InputError for times outside either solution."""
-    a, b = interpolate(reference, reference_imu, frame, t_s), interpolate(rover, rover_imu, frame, t_s)
-    C = frame.C_to_enu(a.r_n)
-    return PairTrajectory(a.t_s, _rotated(C, b.r_n - a.r_n), _rotated(C, b.v_n - a.v_n))
+    """Baseline and relative velocity at times t_s (n,), of points with lever arms from the vehicles' own.
+
+    Raises InputError for times outside either solution.
+    """
+    t_s = np.asarray(t_s, float)
+    r_a, v_a = _point(reference, reference_imu, frame, t_s, reference_lever_b)
+    r_b, v_b = _point(rover, rover_imu, frame, t_s, rover_lever_b)
+    C = frame.C_to_enu(r_a)
+    return PairTrajectory(t_s, _rotated(C, r_b - r_a), _rotated(C, v_b - v_a))
+
+
+def _point(vehicle: VehicleSolution, imu: ImuStream | None, frame: LocalFrame, t_s: Array, lever_b: Vec3) -> tuple[Array, Array]:
+    """Position and velocity (n, 3) of a point of a vehicle."""
+    at = interpolate(vehicle, imu, frame, t_s)
+    if not any(lever_b) or not len(t_s):
+        return at.r_n, at.v_n
+    lever = np.asarray(lever_b, float)
+    around = [np.clip(t_s + h, vehicle.t_s[0], vehicle.t_s[-1]) for h in (-RATE_STEP_S, RATE_STEP_S)]
+    turned = [matrix_from_quat(interpolate(vehicle, imu, frame, t).q_nb) @ lever for t in around]
+    about = (turned[1] - turned[0]) / (around[1] - around[0])[:, None]
+    return at.r_n + matrix_from_quat(at.q_nb) @ lever, at.v_n + about
 
 
 def resample(solution: Solution, problem: NavigationProblem, rate: Rate = "imu") -> Solution:
@@ -113,7 +133,7 @@ def resample(solution: Solution, problem: NavigationProblem, rate: Rate = "imu")
     """
     if rate != "imu" and not 0 < rate < np.inf:
         raise InputError(f"the rate of trajectories must be positive, got {rate} Hz")
-    imus = {v.name: v.imu for v in problem.vehicles}
+    imus = {v.name: problem.vehicle(v.carrier or v.name).imu for v in problem.vehicles}
     vehicles = [
         _vehicle_at(v, imus.get(v.name), solution.frame, _times(v.t_s, rate, imus.get(v.name))) for v in solution.vehicles
     ]
@@ -218,7 +238,8 @@ def _vehicle_at(vehicle: VehicleSolution, imu: ImuStream | None, frame: LocalFra
 def _pair_at(solution: Solution, pair: PairSolution, imus: dict[str, ImuStream | None], rate: Rate) -> PairSolution:
     a, b = imus.get(pair.reference), imus.get(pair.rover)
     t_s = _times(pair.t_s, rate, b if a is None else a)
-    found = interpolate_pair(solution.vehicle(pair.reference), solution.vehicle(pair.rover), a, b, solution.frame, t_s)
+    ends = solution.vehicle(pair.reference), solution.vehicle(pair.rover)
+    found = interpolate_pair(*ends, a, b, solution.frame, t_s, pair.reference_lever_b, pair.rover_lever_b)
     k = earlier_state(pair.t_s, t_s)
     return replace(
         pair,

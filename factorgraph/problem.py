@@ -29,10 +29,14 @@ from factorgraph.measurements import (
     VelocityStream,
     VisionStream,
 )
+from factorgraph.types import Array
 
 Vec3 = tuple[float, float, float]
-Kernel = Literal["none", "huber", "cauchy", "geman-mcclure", "tukey"]
+Sensor = PositionStream | HeightStream | VelocityStream | AttitudeStream | MagneticStream
+HEADING_SIGMA_RAD = 0.3  # of a declared heading
+Kernel = Literal["none", "huber", "cauchy", "geman-mcclure", "tukey", "dcs", "tls", "self-tuned"]
 Elevation = Literal["sine", "flat"]
+NoiseModel = Literal["scale", "elevation", "cn0"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +149,19 @@ class Vehicle:
     motion: MotionPrior = MotionPrior()
     fixed_n: Vec3 | None = None
     truth: Truth | None = None
-    heading_hint_rad: float | None = None  # start heading when no sensor tells
+    heading_hint_rad: float | None = None  # heading at the start, as declared
+    heading_sigma_rad: float = HEADING_SIGMA_RAD
+
+    @property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """All but receiver and IMU."""
+        return (*self.positions, *self.heights, *self.velocities, *self.attitudes, *self.magnetics)
+
+    @property
+    def motion_times(self) -> tuple[Array, ...]:
+        """Times of the sensors that tell how the vehicle moves or is turned, without being positions."""
+        told: tuple[Sensor, ...] = (*self.velocities, *self.attitudes, *self.magnetics)
+        return tuple(sensor.t_s for sensor in told)
 
     @property
     def is_fixed(self) -> bool:
@@ -193,13 +209,20 @@ class AmbiguitySettings:
     fix: bool = True
     ratio_threshold: float = 3.0
     min_success_rate: float = 0.999  # of the subset that partial fixing keeps
+    wide_lanes: bool = False  # differences of two bands' ambiguities are fixed first and held: long baselines, short times
     min_arc_epochs: int = 5
     release_sigma: float = 5.0  # an integer is released when its phase residuals' rms exceeds this many sigma
+    hold: Literal["constant", "switchable"] = "constant"  # switchable: a soft constraint that its phases may switch off
     slip_phase_doppler_cyc: float = 3.0  # threshold of the phase-against-Doppler test
     slip_geometry_free_m: float = 0.05
+    slip_repair: bool = True  # arcs go on over slips that are known for certain
+    slip_success: float = 0.9999  # smallest probability of rounding a slip right that is certain enough
+    slip_gap_s: float = 10.0  # longest gap an arc goes on over
 
     def __post_init__(self) -> None:
-        positive(self, "ratio_threshold", "release_sigma", "slip_phase_doppler_cyc", "slip_geometry_free_m")
+        positive(self, "ratio_threshold", "release_sigma", "slip_phase_doppler_cyc", "slip_geometry_free_m", "slip_gap_s")
+        if not 0 < self.slip_success < 1:
+            raise InputError(f"AmbiguitySettings.slip_success must lie in (0, 1), got {self.slip_success}")
         if not 0 < self.min_success_rate < 1:
             raise InputError(f"AmbiguitySettings.min_success_rate must lie in (0, 1), got {self.min_success_rate}")
 
@@ -209,21 +232,31 @@ class Settings:
     """Choices of the estimation, all with defaults."""
 
     max_state_interval_s: float = 1.0
-    systems: str = "GREJC"  # constellations used, RINEX letters (GLONASS: code and Doppler only)
+    systems: str = "GREJC"  # constellations used, RINEX letters (GLONASS: phases without integers)
     bands: str = "125678"  # RINEX band digits used
     use_absolute: bool = True  # undifferenced code and Doppler in the graph
     # Klobuchar: "broadcast" corrects every observation, "absolute" only undifferenced code, "none" nothing
     ionosphere_model: Literal["broadcast", "absolute", "none"] = "broadcast"
-    ionosphere_ppm: float = 1.0  # differential vertical ionosphere per baseline length, standard deviation; 0: none
+    absolute_code: Literal["single", "ionosphere-free"] = "single"  # of two bands, where a constellation has them
+    ionosphere_ppm: float = 2.0  # differential vertical ionosphere per baseline length, standard deviation; 0: none
     ionosphere_min_baseline_m: float = 10_000.0  # shorter links: antenna phase centres, which are not modelled, matter more
-    ionosphere_step_s: float = 60.0  # piecewise constant per satellite, a random walk between steps
+    ionosphere_step_s: float = 30.0  # between nodes of each satellite, linear between them
     ionosphere_correlation_s: float = 600.0
+    troposphere_mapping: Literal["sine", "niell"] = "sine"  # of the model's delay
+    troposphere_ppm: float = 1.0  # differential wet delay of the zenith per baseline length, standard deviation
+    troposphere_height_ppm: float = 25.0  # and per difference in height: a third of the model's own
+    troposphere_min_baseline_m: float = 10_000.0  # links shorter and more level than these have none
+    troposphere_min_height_m: float = 300.0
+    troposphere_absolute_m: float = 0.0  # wet delay of single receivers over the model's; 0: none
+    troposphere_step_s: float = 120.0
+    troposphere_correlation_s: float = 1800.0
+    inter_system: Literal["free", "constant"] = "free"  # a receiver clock per constellation, or one and constant biases
     ambiguity: AmbiguitySettings = AmbiguitySettings()
     robust: dict[str, Robust] = field(
         default_factory=lambda: {
-            "code": Robust("huber", 2.0),
+            "code": Robust("dcs", 2.5),
             "phase": Robust("huber", 2.5),
-            "doppler": Robust("huber", 2.0),
+            "doppler": Robust("dcs", 2.5),
             "range": Robust("cauchy", 2.0),
             "position": Robust("huber", 2.0),
             "height": Robust("huber", 2.0),
@@ -234,9 +267,18 @@ class Settings:
             "constraint": Robust("huber", 2.0),
         }
     )
+    graduated: bool = False  # approach losses with local minima from convex ones: for bad starts
+    graduation_step: float = 1.4  # factor between steps
     max_iterations: int = 50
     tolerance: float = 1e-5  # relative decrease of the cost that counts as converged
     outlier_sigma: float = 4.0  # normalised residuals beyond this are listed
+    estimate_noise: NoiseModel | Literal["no"] = "no"  # from the residuals, between float solution and integers
+
+    def __post_init__(self) -> None:
+        not_negative(self, "ionosphere_ppm", "troposphere_ppm", "troposphere_height_ppm", "troposphere_absolute_m")
+        positive(self, "ionosphere_step_s", "ionosphere_correlation_s", "troposphere_step_s", "troposphere_correlation_s")
+        if not self.graduation_step > 1:
+            raise InputError(f"Settings.graduation_step must be greater than 1, got {self.graduation_step}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,11 +309,18 @@ class NavigationProblem:
                 raise InputError(
                     f"vehicle {v.name}: its carrier {v.carrier} is no vehicle with states; there are {', '.join(names)}"
                 )
+            if v.carrier is not None and (v.gnss is None or v.imu is not None or v.positions or v.heights or v.is_fixed):
+                raise InputError(f"vehicle {v.name}: an antenna that {v.carrier} carries has gnss and no other sensor")
         tags = [tag for model in self.ranges for tag in model.stream.tags]
         tags += [tag for vision in self.visions for tag in (vision.observer, vision.target)]
         for tag in tags:
             if tag.vehicle is not None and tag.vehicle not in names:
                 raise InputError(f"tag {tag.name}: no vehicle named {tag.vehicle}; there are {', '.join(names)}")
+
+    @property
+    def bodies(self) -> tuple[Vehicle, ...]:
+        """The vehicles that have states, or stand still: all but antennas carried by another."""
+        return tuple(v for v in self.vehicles if v.carrier is None)
 
     def vehicle(self, name: str) -> Vehicle:
         return next(v for v in self.vehicles if v.name == name)

@@ -70,6 +70,9 @@ class PairSolution:
     n_sat: IntArray  # (n,) satellites in the differences
     truth_enu: Array | None = None  # (n, 3) true baseline at t_s, NaN where unknown
     truth_velocity_enu: Array | None = None  # (n, 3)
+    # from the vehicles' own points to those that the pair relates: antennas carried by a vehicle
+    reference_lever_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rover_lever_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +86,34 @@ class AmbiguityTable:
     t_end_s: Array = field(default_factory=lambda: np.zeros(0))
     float_cyc: Array = field(default_factory=lambda: np.zeros(0))  # relative to the datum arc of its group
     sigma_cyc: Array = field(default_factory=lambda: np.zeros(0))
-    integer: Array = field(default_factory=lambda: np.zeros(0))  # NaN when left float
+    # at the arc's first phase not flagged as ambiguous by half a cycle; NaN when left float
+    integer: Array = field(default_factory=lambda: np.zeros(0))
     state: tuple[str, ...] = ()  # "fixed", "float", "released", "datum"
+
+
+@dataclass(frozen=True, slots=True)
+class SlipTable:
+    """One row per slip or end of an arc between two phases of a link's satellite and signal."""
+
+    link: tuple[str, ...] = ()  # "reference-rover"
+    satellite: tuple[str, ...] = ()
+    signal: tuple[str, ...] = ()
+    t_s: Array = field(default_factory=lambda: np.zeros(0))  # of the first phase after it
+    cycles: Array = field(default_factory=lambda: np.zeros(0))  # what a repair took off; NaN where the arc ended
+    sigma_cyc: Array = field(default_factory=lambda: np.zeros(0))  # before rounding
+    repaired: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
+    cause: tuple[str, ...] = ()  # what found it: "gap", "loss of lock", "prediction", ...
+
+    def of_link(self, link: str) -> SlipTable:
+        """The rows of one link."""
+        mine = np.flatnonzero(np.array([name == link for name in self.link], bool))
+        texts = (tuple(column[i] for i in mine) for column in (self.link, self.satellite, self.signal, self.cause))
+        names, satellites, signals, causes = texts
+        numbers = (self.t_s[mine], self.cycles[mine], self.sigma_cyc[mine], self.repaired[mine])
+        return SlipTable(names, satellites, signals, *numbers, causes)
+
+
+OUTLIER_CLASSES = ("", "gross", "multipath", "nlos", "slip")  # "": no outlier
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +133,15 @@ class ResidualTable:
     outlier: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
     azimuth_rad: Array = field(default_factory=lambda: np.zeros(0))  # NaN where not GNSS
     elevation_rad: Array = field(default_factory=lambda: np.zeros(0))
+    cn0_dbhz: Array = field(default_factory=lambda: np.zeros(0))  # NaN where not known
+    outlier_class: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (n,) index into OUTLIER_CLASSES
+
+    def __post_init__(self) -> None:
+        n = len(self.t_s)  # a method need not tell signal strength, and may call all its outliers gross
+        if len(self.cn0_dbhz) != n:
+            object.__setattr__(self, "cn0_dbhz", np.full(n, np.nan))
+        if len(self.outlier_class) != n:
+            object.__setattr__(self, "outlier_class", self.outlier.astype(np.int64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,9 +192,12 @@ class Solution:
     diagnostics: Diagnostics
     configuration: dict[str, object] = field(default_factory=dict)  # plain JSON types
     versions: dict[str, str] = field(default_factory=dict)
+    carriers: dict[str, str] = field(default_factory=dict)  # carried antenna -> the vehicle that carries it
+    slips: SlipTable = field(default_factory=SlipTable)
 
     def vehicle(self, name: str) -> VehicleSolution:
-        return next(v for v in self.vehicles if v.name == name)
+        """The solution of a vehicle, or of the vehicle that carries an antenna of that name."""
+        return next(v for v in self.vehicles if v.name == self.carriers.get(name, name))
 
     def pair(self, reference: str, rover: str) -> PairSolution:
         return next(p for p in self.pairs if (p.reference, p.rover) == (reference, rover))

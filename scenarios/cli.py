@@ -309,8 +309,11 @@ def flight_name(flight: str) -> str:
 def check_writable(folder: Path) -> None:
     """Try, before the long work, whether a folder of results can be made and written; nothing is left behind.
 
-    Raises InputError where a file is in the way, OSError where writing fails.
+    Raises InputError where a file or a dead link is in the way, OSError where writing fails.
     """
+    dead = next((p for p in (folder, *folder.parents) if p.is_symlink() and not p.exists()), None)
+    if dead is not None:
+        raise InputError(f"cannot write to {folder}: {dead} is a link to {dead.readlink()}, which is not there")
     existing = next(p for p in (folder, *folder.parents) if p.exists())
     if not existing.is_dir():
         raise InputError(f"cannot write to {folder}: {existing} is a file; choose another folder")

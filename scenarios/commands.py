@@ -143,7 +143,18 @@ def _estimate(args: argparse.Namespace, stages: Stages) -> tuple[NavigationProbl
         _tell_dropped(report, stages)
     problem = dataclasses.replace(flight.problem, settings=override(flight.problem.settings, args.set))
     stages("solving")
-    return problem, registry.solve(problem, args.method, stages)
+    doubts = tuple(str(finding) for finding in flight.examined.findings)
+    try:
+        solution = registry.solve(problem, args.method, stages)
+    except InputError as error:
+        raise InputError(f"{error}; doubtful in the flight: {doubts[0]}" if doubts else str(error)) from error
+    return problem, _with_doubts(solution, doubts)
+
+
+def _with_doubts(solution: Solution, doubts: tuple[str, ...]) -> Solution:
+    """The solution with what is doubtful in its input among the warnings."""
+    told = dataclasses.replace(solution.diagnostics, warnings=(*doubts, *solution.diagnostics.warnings))
+    return dataclasses.replace(solution, diagnostics=told) if doubts else solution
 
 
 def _tell_dropped(report: ReadReport, stages: Stages) -> None:
@@ -259,19 +270,23 @@ def simulate(args: argparse.Namespace) -> int:
 
 
 def check(args: argparse.Namespace) -> int:
-    """Tell what a flight holds."""
+    """Tell what a flight holds, and what in it is doubtful (DEGRADED) or cannot be right (InputError, after the tables)."""
     from scenarios.flights import load
     from scenarios.flights.check import as_json, render
     from scenarios.flights.check import check as inspect
 
     with Stages() as stages:
         stages("reading the flight")
-        tables = inspect(load(args.flight, args.data))
+        flight = load(args.flight, args.data, strict=False)
+        tables = inspect(flight)
     if args.json:
         print(json.dumps(as_json(tables), indent=1, ensure_ascii=False))
     else:
         stdout_console().print(render(tables))
-    return guard.DONE
+    findings = flight.examined.findings
+    if findings and findings[0].is_wrong:
+        raise InputError(str(findings[0]))
+    return guard.DEGRADED if findings else guard.DONE
 
 
 def report(args: argparse.Namespace) -> int:

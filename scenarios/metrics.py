@@ -16,6 +16,7 @@ from scipy.interpolate import CubicHermiteSpline
 from factorgraph.attitude import log_so3, matrix_from_quat
 from factorgraph.consistency import Consistency, judge, nees, standard_deviations
 from factorgraph.measurements import Truth
+from factorgraph.models.outliers import class_counts
 from factorgraph.solution import ATT, POS, VEL, Fix, PairSolution, Solution, VehicleSolution
 from factorgraph.types import Array, BoolArray, IntArray
 
@@ -243,6 +244,7 @@ def _whole_rows(solution: Solution) -> list[SummaryRow]:
     if len(table.t_s):
         rows.append(SummaryRow("solution", "outliers", int(np.sum(table.outlier)), ""))
         rows.append(SummaryRow("solution", "outliers, share", 100.0 * float(np.mean(table.outlier)), "%"))
+        rows += [SummaryRow("solution", f"outliers, {words}", n, "") for words, n in class_counts(table).items()]
     if len(diagnostics.nis):
         inside = judge(diagnostics.nis_t_s, diagnostics.nis, diagnostics.nis_dof).share_inside
         rows.append(SummaryRow("solution", "NIS in band", 100.0 * inside, "%"))

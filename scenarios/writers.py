@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 from factorgraph.attitude import euler_from_matrix, matrix_from_quat
 from factorgraph.geodesy import LocalFrame, geodetic_from_ecef
 from factorgraph.gpstime import WEEK_S, GpsTime
-from factorgraph.solution import ATT, BA, BG, POS, VEL, Fix, PairSolution, Solution, VehicleSolution
+from factorgraph.solution import ATT, BA, BG, OUTLIER_CLASSES, POS, VEL, Fix, PairSolution, Solution, VehicleSolution
 from factorgraph.types import Array, IntArray
 from scenarios.solutions import replace_with
 
@@ -124,6 +124,8 @@ def _residual_table(solution: Solution) -> pa.Table:
         n: pa.DictionaryArray.from_arrays(index.astype(np.int32), pa.array(list(names), pa.string())) for n, names, index in texts
     }
     columns |= {"residual": r.residual, "sigma": r.sigma, "weight": r.weight, "outlier": r.outlier}
+    classes = pa.DictionaryArray.from_arrays(r.outlier_class.astype(np.int32), pa.array(list(OUTLIER_CLASSES), pa.string()))
+    columns |= {"outlier_class": classes, "cn0_dbhz": r.cn0_dbhz}
     return pa.table(columns | {"azimuth_deg": np.degrees(r.azimuth_rad), "elevation_deg": np.degrees(r.elevation_rad)})
 
 

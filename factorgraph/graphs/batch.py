@@ -13,14 +13,17 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph import start
-from factorgraph.graphs import integers
+from factorgraph.graphs import graduated, integers, noise, phases, wide_lanes
+from factorgraph.graphs.attitudes import start_attitudes
 from factorgraph.graphs.blocks import KINDS
 from factorgraph.graphs.build import Built, build, correct_again, native_factors
+from factorgraph.graphs.covariance import JointCovariance
 from factorgraph.graphs.optimizer import Graph, Result, optimise
 from factorgraph.graphs.result import make_solution
 from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.grid import common_grid
 from factorgraph.models.receivers import Receiver, receivers
+from factorgraph.motion_imu import with_attitudes
 from factorgraph.problem import MotionPrior, NavigationProblem, Robust, Settings
 from factorgraph.registry import Progress
 from factorgraph.solution import Solution, Status
@@ -30,10 +33,13 @@ START_MOTION = MotionPrior((3.0, 3.0, 3.0))  # for the first graph, vehicles wit
 START_ROBUST = {kind: Robust("huber", 2.0) for kind in ("code", "doppler", "range", "position", "height")}
 WIDENED = (8.0, 4.0, 2.0)  # times the width of a loss with local minima, while starts from ranges alone are far off
 FIX_ROUNDS = 8
+NOISE_ROUNDS = 5
+SLIP_ROUNDS = 3  # of fixing, while fixed solutions show slips
 CORRECTED_M = 1e-4  # change of a correction that is worth another solution
 ROUGH = 1e-3  # tolerance between rounds; only the last solution needs the settings' own
 FIRST = 3e-2  # tolerance before the first biases are known
 OFFSET_S = 1e-4  # change of a time offset that asks for it too
+RESCALE = 2e-4  # and of a scale factor
 REBIAS = np.array([3e-3, 3e-3, 3e-3, 0.1, 0.1, 0.1])  # bias change that asks for preintegrating again
 
 
@@ -45,15 +51,16 @@ class Batch:
     def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
         """Solve a problem. Raises InputError for what cannot be estimated; anything less is in the diagnostics."""
         clock = _Clock(progress)
+        problem = with_attitudes(problem)
         grid = common_grid(problem)
         rx = receivers(problem)
         clock.stage("start values", 0.1)
-        vehicles = [VehicleVariables(i, v, grid, problem.frame) for i, v in enumerate(problem.vehicles)]
+        vehicles = [VehicleVariables(i, v, grid, problem.frame) for i, v in enumerate(problem.bodies)]
         notes = self._start(problem, vehicles, rx, grid)
         clock.stage("building the graph", 0.25)
         built = build(problem, vehicles, rx, use_phase=True)
         for data in built.links:
-            integers.start_ambiguities(data)
+            phases.prepare(data, problem.settings.ambiguity)
         result, ratio = self._optimise(problem, built, clock)
         clock.stage("covariances", 0.9)
         solution = make_solution(problem, built, result, ratio, clock.spent, notes)
@@ -99,10 +106,7 @@ class Batch:
                 notes.append("the start graph was singular")
         for v, r in zip(vehicles, rough, strict=True):
             v.r, v.v = r.r.copy(), r.v.copy()
-            if v.mode == "imu":
-                v.R, bias = start.align(v.imu, grid, v.r, v.v, problem.frame, v.vehicle.heading_hint_rad)
-                v.bias[:, :3] = bias
-        return notes
+        return notes + start_attitudes(problem, vehicles, rough, rx)
 
     @staticmethod
     def _start_positions(problem: NavigationProblem, v: VehicleVariables, rx: dict[str, Receiver], grid: Array) -> bool:
@@ -130,33 +134,84 @@ class Batch:
         settings, graph = problem.settings, built.graph
         clock.stage("float solution", 0.3)
         placed = all(v.is_fixed or v.gnss is not None or v.positions for v in problem.vehicles)
+        if settings.graduated:
+            graduated.approach(graph, settings.robust, settings.graduation_step, clock.iteration)
         # starts found from ranges alone may be far off
-        for wide in [] if placed else _widened(settings, graph):
+        for wide in [] if placed or settings.graduated else _widened(settings, graph):
             self._settle(replace(problem, settings=wide), graph, clock)
         result = self._settle(problem, graph, clock)
         if max((correct_again(problem, data, built.receivers, built.ends) for data in built.links), default=0.0) > CORRECTED_M:
             result = self._continue(problem, graph, result, clock)
         for _ in range(4):
-            if not sum(integers.split_slipped(data, settings.ambiguity) for data in built.links if len(data.block.amb_key)):
+            if not sum(phases.split_slipped(data, settings.ambiguity) for data in built.links):
                 break
             result = self._continue(problem, graph, result, clock)
+        declared = noise.declared(graph) if settings.estimate_noise != "no" else []
+        if declared:
+            clock.stage("noise levels", 0.5)
+            result = self._estimate_noise(problem, built, result, clock, declared, is_float=True)
         ratio = np.nan
         if not settings.ambiguity.fix or not any(len(d.block.amb_key) for d in built.links):
             return self._continue(problem, graph, result, clock, settings.tolerance), ratio
         clock.stage("integers", 0.6)
+        if result.bayes_net is not None and phases.open_halves(built.links, result.bayes_net, settings.ambiguity):
+            result = self._continue(problem, graph, result, clock)
+        for _ in range(SLIP_ROUNDS):
+            result, ratio = self._fix(problem, built, result, clock)
+            # what integers hold in place shows slips that floats gave way to
+            if not sum(phases.split_slipped(data, settings.ambiguity, join=False) for data in built.links):
+                break
+            graph.blocks = [b for b in graph.blocks if not b.is_stale]
+            result = self._continue(problem, graph, result, clock)
+        if declared:
+            result = self._estimate_noise(problem, built, result, clock, declared, is_float=False)
+            result, again = self._fix(problem, built, result, clock)
+            ratio = float(np.fmin(ratio, again))
+        return self._continue(problem, graph, result, clock, settings.tolerance), ratio
+
+    def _estimate_noise(
+        self,
+        problem: NavigationProblem,
+        built: Built,
+        result: Result,
+        clock: _Clock,
+        declared: list[noise.Declared],
+        is_float: bool,
+    ) -> Result:
+        """Standard deviations from the residuals, and a solution with them, until they stay."""
+        graph, model = built.graph, problem.settings.estimate_noise
+        for _ in range(NOISE_ROUNDS):
+            net = graph.covariance_net()
+            if net is None or model == "no":
+                break
+            cov = JointCovariance(net)
+            built.noise, change = noise.estimate(model, declared, built.links, built.receivers, cov, is_float)
+            result = self._continue(problem, graph, result, clock)
+            if change < noise.SETTLED:
+                break
+        return result
+
+    def _fix(self, problem: NavigationProblem, built: Built, result: Result, clock: _Clock) -> tuple[Result, float]:
+        """Integers fixed where they can be, released where their residuals refuse them, and the smallest ratio."""
+        settings, graph, ratio = problem.settings, built.graph, np.nan
         for _ in range(FIX_ROUNDS):
+            if settings.ambiguity.wide_lanes and result.bayes_net is not None:
+                if wide_lanes.hold(graph, built.links, result.bayes_net, settings.ambiguity):
+                    result = self._continue(problem, graph, result, clock)
+                if wide_lanes.release_refused(graph, settings.ambiguity):
+                    result = self._continue(problem, graph, result, clock)
             if result.bayes_net is None:
                 break
             fixed = integers.fix_integers(graph, built.links, result.bayes_net, settings.ambiguity)
             if fixed.fixed:
                 ratio = fixed.ratio if np.isnan(ratio) else min(ratio, fixed.ratio)
                 result = self._continue(problem, graph, result, clock)
-            released = integers.release_refused(built.links, settings.ambiguity)
+            released = integers.release_refused(graph, built.links, settings.ambiguity)
             if released:
                 result = self._continue(problem, graph, result, clock)
             if not fixed.fixed and not released:
                 break
-        return self._continue(problem, graph, result, clock, settings.tolerance), ratio
+        return result, ratio
 
     def _settle(self, problem: NavigationProblem, graph: Graph, clock: _Clock) -> Result:
         """Optimise, preintegrating again while biases and time offsets move away from those preintegrated at."""
@@ -171,14 +226,15 @@ class Batch:
                 v.mode == "imu" and np.any(np.abs(v.bias - v.preintegrated_bias).max(axis=0) > REBIAS) for v in graph.vehicles
             )
             offsets = graph.parameters.offsets_s()
-            stale = biased or bool(np.any(np.abs(offsets - taken) > OFFSET_S))
+            scaled = any(np.any(np.abs(v.imu_scale - v.applied_scale) > RESCALE) for v in graph.vehicles)
+            stale = biased or scaled or bool(np.any(np.abs(offsets - taken) > OFFSET_S))
             if turn and (not stale or result.status is not Status.CONVERGED):
                 break
             if not stale:
                 continue
             taken = offsets
             for v in graph.vehicles:
-                v.apply_imu_offset()
+                v.apply_imu_calibration()
             native_factors(graph)
             for block in graph.blocks:
                 block.refresh()

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import gtsam
@@ -20,12 +20,14 @@ import numpy as np
 from numba import njit
 
 from factorgraph.attitude import skew
+from factorgraph.graphs._point_kernels import one_way
+from factorgraph.graphs.nodes import Nodes
 from factorgraph.graphs.parameters import Parameter
 from factorgraph.graphs.variables import Point, Query, VehicleVariables
 from factorgraph.models.differencing import CommonGroups
+from factorgraph.models.robust import Loss
 from factorgraph.models.robust import cost as robust_cost
 from factorgraph.models.robust import weight as robust_weight
-from factorgraph.problem import Robust
 from factorgraph.types import Array, BoolArray, IntArray
 
 KINDS = (
@@ -51,6 +53,13 @@ class Rows:
     group_index: IntArray
     azimuth_rad: Array
     elevation_rad: Array
+    persistence: Array | float = 1.0  # times the standard deviation of a single row that sigma is, for errors that last
+    cn0_dbhz: Array | None = None  # (n,) the weaker of the two where differenced
+
+    @property
+    def single_sigma(self) -> Array:
+        """Standard deviations (n,) of the rows by themselves: what residuals are judged by."""
+        return self.sigma / self.persistence
 
 
 @dataclass(slots=True)
@@ -73,6 +82,7 @@ class Block(ABC):
     u: Array = field(init=False)  # (n,) sqrt(w) / sigma
     active: BoolArray = field(init=False)  # (n,) rows in use
     made: gtsam.NonlinearFactorGraph | None = field(default=None, init=False)  # its factors, until their keys change
+    nodes: list[Nodes] = field(default_factory=list, init=False)  # what changes slowly and these rows see
 
     def __post_init__(self) -> None:
         self.w = np.ones(len(self.rows.sigma))
@@ -104,16 +114,21 @@ class Block(ABC):
     def predict(self) -> None:
         """Set y and J at the current variables."""
 
+    @property
+    def is_stale(self) -> bool:
+        """Whether the arcs that it was made for are no more."""
+        return False
+
     def refresh(self) -> None:  # noqa: B027 - most blocks have nothing to renew
         """Renew what depends on the preintegration bias."""
 
     def normalised(self) -> Array:
-        """Residuals (n,) over their own standard deviation, the group's common clock taken out."""
-        s = self.rows.sigma
+        """Residuals (n,) over the standard deviation of a single row, the group's common clock taken out."""
+        s = self.rows.single_sigma
         clocks = self.rows.clocks
         if clocks is None:
             return self.y / s
-        u = np.sqrt(self.w) / s
+        u = self._clock_u(clocks)
         res = self.y - clocks.mean(self.y, u)[clocks.of_row]
         h = clocks.leverage(u)
         return res / (s * np.sqrt(np.maximum(1 - h, 0.05)))
@@ -123,24 +138,43 @@ class Block(ABC):
         clocks = self.rows.clocks
         if clocks is None:
             return self.y
-        return self.y - clocks.mean(self.y, np.sqrt(self.w) / self.rows.sigma)[clocks.of_row]
+        return self.y - clocks.mean(self.y, self._clock_u(clocks))[clocks.of_row]
 
-    def reweight(self, robust: dict[str, Robust]) -> None:
+    def _clock_u(self, clocks: CommonGroups) -> Array:
+        """sqrt(w) / sigma (n,); as without robust weights in groups that have lost all of theirs, which would never return."""
+        u = np.sqrt(self.w) / self.rows.sigma
+        lost = clocks.sum(u * u) == 0
+        return np.where(lost[clocks.of_row] & self.active, 1 / self.rows.sigma, u) if np.any(lost) else u
+
+    def reweight(self, losses: Mapping[str, Loss], afresh: bool = False) -> None:
+        """Robust weights of the current residuals.
+
+        The common clocks are those of the weights before, or, `afresh`, the medians of their groups: least squares' own
+        would be drawn off by gross errors, and a loss that redescends would then reject all rows alike.
+        """
         self.w = np.where(self.active, self.w, 0.0)
-        t = self.normalised()
-        for index, name in enumerate(KINDS):
-            mine = self.active & (self.rows.kind == index)
-            if name in robust and np.any(mine):
-                self.w[mine] = robust_weight(robust[name], t[mine])
+        clocks = self.rows.clocks
+        if afresh and clocks is not None:
+            centre = clocks.median(self.y, self.active)
+            self._weigh((self.y - centre[clocks.of_row]) / self.rows.single_sigma, losses)
+        self._weigh(self.normalised(), losses)
 
-    def cost(self, robust: dict[str, Robust]) -> float:
-        """Robust cost at the current residuals; the clock means use the current weights. Priors (kind -1) are quadratic."""
-        r = self.residuals() / self.rows.sigma
-        total = 0.5 * float(np.sum(r[self.rows.kind < 0] ** 2))
+    def _weigh(self, t: Array, losses: Mapping[str, Loss]) -> None:
         for index, name in enumerate(KINDS):
             mine = self.active & (self.rows.kind == index)
+            if name in losses and np.any(mine):
+                self.w[mine] = robust_weight(losses[name], t[mine])
+
+    def cost(self, losses: Mapping[str, Loss]) -> float:
+        """Robust cost at the current residuals; the clock means use the current weights. Priors (kind -1) are quadratic."""
+        rows = self.rows
+        r = self.residuals() / rows.single_sigma
+        scale = np.broadcast_to(np.asarray(1 / np.square(rows.persistence)), r.shape)
+        total = 0.5 * float(np.sum(scale[rows.kind < 0] * r[rows.kind < 0] ** 2))
+        for index, name in enumerate(KINDS):
+            mine = self.active & (rows.kind == index)
             if np.any(mine):
-                total += float(np.sum(robust_cost(robust.get(name), r[mine])))
+                total += float(np.sum(scale[mine] * robust_cost(losses.get(name), r[mine])))
         return total
 
     def whiten(self) -> None:
@@ -287,6 +321,17 @@ class Endpoint:
         return had != (self.query.increments is None) or bool(np.any(self.query.k != before))
 
 
+def share_states(a: Endpoint, b: Endpoint) -> None:
+    """Let two points of one vehicle follow from the same states, so that their columns are the same."""
+    if a.vehicle is not b.vehicle or a.vehicle.mode != "imu":
+        return
+    states = np.minimum(a.query.k, b.query.k)
+    for end in (a, b):
+        q = end.query
+        if np.any(q.k != states):
+            end.query = end.vehicle.query(end.vehicle.t_s[q.k] + q.dt_s, q.lever_b, states)
+
+
 class Columns:
     """Columns of a block with several ends: those of one end after those of another, what they share only once."""
 
@@ -415,20 +460,21 @@ class HeightBlock(EndsBlock):
 class RangeBlock(EndsBlock):
     """Ranges between two points: z = (1 + scale) |a - b| + bias.
 
-    `a` is on a vehicle; `b` on another vehicle or fixed. Bias and scale are one two-element parameter.
+    `a` is on a vehicle; `b` on another vehicle or fixed.
     """
 
     a: Endpoint
     b: Endpoint | None
     anchor_n: Array | None  # (n, 3) when b is None
     z_m: Array  # (n,)
-    parameter: Parameter | None  # None when neither is estimated
+    bias: Parameter | None = None
+    scale: Parameter | None = None
 
     def ends(self) -> list[Endpoint]:
         return [self.a] if self.b is None else [self.a, self.b]
 
     def parameters(self) -> list[Parameter]:
-        return [] if self.parameter is None else [self.parameter]
+        return [p for p in (self.bias, self.scale) if p is not None]
 
     def predict(self) -> None:
         pa = self.a.points(velocity=False)
@@ -440,10 +486,11 @@ class RangeBlock(EndsBlock):
             d, others = pa.r_n - self.anchor_n, []
         rho = np.maximum(np.linalg.norm(d, axis=1), 1e-6)
         e = d / rho[:, None]
-        bias, scale = (0.0, 0.0) if self.parameter is None else self.parameter.value
+        bias, scale = (0.0 if p is None else p.value[0] for p in (self.bias, self.scale))
         self.y = self.z_m - (1 + scale) * rho - bias
         J = [(1 + scale) * np.einsum("ni,niw->nw", e, part) for part in (pa.J_r, *others)]
-        self.J = self.columns_of.join(J, [] if self.parameter is None else [np.column_stack([np.ones(self.n), rho])])
+        own = [by for p, by in ((self.bias, np.ones(self.n)), (self.scale, rho)) if p is not None]
+        self.J = self.columns_of.join(J, [column[:, None] for column in own])
 
 
 @dataclass(slots=True)
@@ -469,43 +516,16 @@ class MotionBlock(Block):
 
 
 @dataclass(slots=True)
-class IonosphereBlock(Block):
-    """Prior and random walk of a link's differential ionosphere: one row per variable, zero mean."""
-
-    of: GnssBlock
-    previous: IntArray  # (n,) variable before it in time of the same satellite, -1 for the first
-
-    def keys(self, f: int) -> list[int]:
-        own = int(self.of.iono_key[f])
-        return [own] if self.previous[f] < 0 else [own, int(self.of.iono_key[self.previous[f]])]
-
-    def widths(self) -> tuple[int, ...]:
-        return (1, 1)
-
-    def predict(self) -> None:
-        x = self.of.iono_value
-        self.y = -np.where(self.previous >= 0, x - x[self.previous], x)
-        self.J = np.tile([1.0, -1.0], (self.n, 1))
-
-    def columns(self, f: int) -> list[Array]:
-        return Block.columns(self, f)[: len(self.keys(f))]
-
-    def _carrier(self, f: int, i: int, j: int, edges: list[tuple[int, int]]) -> gtsam.CustomFactor:
-        return Block._carrier(self, f, i, j, edges[: 1 if self.previous[f] < 0 else 2])
-
-
-@dataclass(slots=True)
 class JointBlock(Block):
-    """One empty row per state: no information, only joint elimination of two vehicles' poses and velocities."""
+    """One empty row per state: no information, only joint elimination of several vehicles' poses and velocities."""
 
-    a: VehicleVariables
-    b: VehicleVariables
+    vehicles: tuple[VehicleVariables, ...]
 
     def keys(self, f: int) -> list[int]:
-        return [*self.a.keys(f)[:2], *self.b.keys(f)[:2]]
+        return [key for v in self.vehicles for key in v.keys(f)[:2]]
 
     def widths(self) -> tuple[int, ...]:
-        return (*self.a.dims[:2], *self.b.dims[:2])
+        return tuple(d for v in self.vehicles for d in v.dims[:2])
 
     def predict(self) -> None:
         self.y, self.J = np.zeros(self.n), np.zeros((self.n, sum(self.widths())))
@@ -612,43 +632,60 @@ class GnssBlock(EndsBlock):
     wavelength_m: Array  # (n,)
     arc: IntArray  # (n,) ambiguity arc of a phase row, -1 elsewhere
     amb_key: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (arcs,) 0: constant
-    amb_value: Array = field(default_factory=lambda: np.zeros(0))  # (arcs,) cycles
+    amb_value: Array = field(default_factory=lambda: np.zeros(0))  # (arcs,) units
+    amb_unit_cyc: Array = field(default_factory=lambda: np.zeros(0))  # (arcs,) 1; 0.5 where halves of a cycle are open
+    jump_cyc: Array = field(init=False)  # (n,) repaired slips within the row's arc
+    by_rover: Array = field(init=False)  # (n, 3) gradient of the prediction by the rover's antenna
     place_n: Array | None = None  # (m, 3) one per factor: where a moving reference is taken to be
-    iono: IntArray = field(init=False)  # (n,) row -> ionosphere variable, -1 none
-    iono_scale: Array = field(init=False)  # (n,) metres of this row per metre of it
-    iono_key: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
-    iono_value: Array = field(default_factory=lambda: np.zeros(0))  # vertical at L1, rover minus reference [m]
+    biases: list[Parameter] = field(default_factory=list)  # constants between groups that share clocks
+    bias_of: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (n,) row -> bias, -1 none; empty without biases
+    clock_index: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (n,) clock within epoch and kind
     scalar_columns: ScalarColumns | None = None  # until factors are renewed
 
     def __post_init__(self) -> None:
+        self.regroup()
         EndsBlock.__post_init__(self)
-        self.iono, self.iono_scale = np.full(self.n, -1, np.int64), np.zeros(self.n)
+        self.jump_cyc = np.zeros(self.n)
 
     def ends(self) -> list[Endpoint]:
         return [self.rover] if self.reference is None else [self.rover, self.reference]
+
+    def parameters(self) -> list[Parameter]:
+        return self.biases
 
     def keys(self, f: int) -> list[int]:
         return [*self.columns_of.keys(f), *self.scalars(f)]
 
     def regroup(self) -> None:
-        """A factor per epoch, whatever its states."""
+        """A factor per epoch, whatever its states; two antennas of one vehicle are seen from the same state."""
+        if self.reference is not None:
+            share_states(self.rover, self.reference)
 
     def scalars(self, f: int) -> list[int]:
-        """Keys of the ambiguities and ionospheres of factor f that are variables."""
+        """Keys of the ambiguities and nodes of factor f that are variables."""
         c = self._entries()
         return [int(k) for k in c.keys[c.first_key[f] : c.first_key[f + 1]]]
+
+    def sightings(self) -> tuple[IntArray, Array]:
+        """Keys (m,) of ambiguities and nodes that are variables, and the times at which factors have them."""
+        c = self._entries()
+        t_s = self.rows.t_s[self.rows.factor.start]
+        return c.keys, np.repeat(t_s, np.diff(c.first_key))
 
     def _entries(self) -> ScalarColumns:
         if self.scalar_columns is None:
             arc_free = self.arc >= 0
             arc_free[arc_free] = self.amb_key[self.arc[arc_free]] != 0
-            a, i = np.flatnonzero(arc_free), np.flatnonzero(self.iono >= 0)
-            row = np.concatenate([a, i])
-            key = np.concatenate([self.amb_key[self.arc[a]], self.iono_key[self.iono[i]]])
-            self.scalar_columns = ScalarColumns.of(
-                row, key, np.concatenate([self.wavelength_m[a], self.iono_scale[i]]), self.rows.factor, self.n
-            )
+            a = np.flatnonzero(arc_free)
+            row = np.concatenate([a, *(nodes.row for nodes in self.nodes)])
+            key = np.concatenate([self.amb_key[self.arc[a]], *(nodes.key[nodes.node] for nodes in self.nodes)])
+            scale = np.concatenate([self.unit_m(a), *(nodes.scale for nodes in self.nodes)])
+            self.scalar_columns = ScalarColumns.of(row, key, scale, self.rows.factor, self.n)
         return self.scalar_columns
+
+    def unit_m(self, phases: IntArray) -> Array:
+        """Metres per unit of the ambiguities of phase rows (m,)."""
+        return np.asarray(self.wavelength_m[phases] * self.amb_unit_cyc[self.arc[phases]])
 
     def renew(self) -> None:
         """Call when ambiguities became constants or variables: the factors' keys change with them."""
@@ -688,7 +725,7 @@ class GnssBlock(EndsBlock):
         rover = self.rover.points(velocity=has_rate)
         if self.reference is None:
             y, by_r, e = self._one_way(rover.r_n, rover.v_n, self.sat_rover, self.vel_rover)
-            self.J = self.columns_of.join([self._jacobian(by_r, e, rover)])
+            self.J = self.columns_of.join([self._jacobian(by_r, e, rover)], self._of_biases())
         else:
             reference = self.reference.points(velocity=has_rate)
             at = reference.r_n if self.place_n is None else self.place_n
@@ -696,24 +733,23 @@ class GnssBlock(EndsBlock):
             y_ref, by_r_ref, e_ref = self._one_way(at, reference.v_n, self.sat_reference, self.vel_reference)
             y -= y_ref
             by_r_ref = by_r_ref if self.place_n is None else by_r
-            self.J = self.columns_of.join([self._jacobian(by_r, e, rover), -self._jacobian(by_r_ref, e_ref, reference)])
-        phase = self.arc >= 0
-        y[phase] += self.wavelength_m[phase] * self.amb_value[self.arc[phase]]
-        if len(self.iono_value):
-            y += np.where(self.iono >= 0, self.iono_scale * self.iono_value[self.iono], 0.0)
+            parts = [self._jacobian(by_r, e, rover), -self._jacobian(by_r_ref, e_ref, reference)]
+            self.J = self.columns_of.join(parts, self._of_biases())
+        self.by_rover = by_r
+        phase = np.flatnonzero(self.arc >= 0)
+        y[phase] += self.unit_m(phase) * self.amb_value[self.arc[phase]] + self.wavelength_m[phase] * self.jump_cyc[phase]
+        for nodes in self.nodes:
+            y += nodes.seen(self.n)
+        if self.biases:
+            y += np.append([float(bias.value[0]) for bias in self.biases], 0.0)[self.bias_of]  # -1: the appended zero
         self.y = self.z - y
+
+    def _of_biases(self) -> list[Array]:
+        return [(self.bias_of == i)[:, None].astype(float) for i in range(len(self.biases))]
 
     def _one_way(self, r: Array, v: Array, sat: Array, vel: Array) -> tuple[Array, Array, Array]:
         """Range or range rate (n,) of every row to its point r, v (m, 3), its gradient by r (n, 3), and the direction (n, 3)."""
-        at, is_rate = self.point_rover, self.rows.kind == DOPPLER
-        d = sat - r[at]
-        rho = np.linalg.norm(d, axis=1)
-        e = d / rho[:, None]
-        rel = vel - v[at]
-        rate = np.einsum("ni,ni->n", e, rel)
-        # d rate / d r = -(rel - e (e . rel)) / rho
-        by_r = np.where(is_rate[:, None], -(rel - e * rate[:, None]) / rho[:, None], -e)
-        return np.where(is_rate, rate, rho), by_r, e
+        return one_way(self.point_rover, self.rows.kind == DOPPLER, r, v, sat, vel)  # type: ignore[no-any-return]
 
     def _jacobian(self, by_r: Array, e: Array, point: Point) -> Array:
         return np.asarray(_point_jacobians(self.point_rover, by_r, self.rows.kind == DOPPLER, -e, point.J_r, point.J_v))

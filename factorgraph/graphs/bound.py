@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from factorgraph.attitude import matrix_from_quat
-from factorgraph.graphs import integers
+from factorgraph.graphs import phases
 from factorgraph.graphs.build import build
 from factorgraph.graphs.covariance import JointCovariance
-from factorgraph.graphs.result import pair_covariance
+from factorgraph.graphs.pairs import pair_covariance, pair_ends
 from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.grid import common_grid
 from factorgraph.models.receivers import receivers
@@ -29,7 +29,7 @@ def posterior_bound(problem: NavigationProblem, integers_known: bool = True) -> 
     pair (reference, rover), the bound (K, 6, 6) resolved east-north-up at the reference.
     """
     grid = common_grid(problem)
-    vehicles = [VehicleVariables(i, v, grid, problem.frame) for i, v in enumerate(problem.vehicles)]
+    vehicles = [VehicleVariables(i, v, grid, problem.frame) for i, v in enumerate(problem.bodies)]
     for v in vehicles:
         if v.mode == "fixed":
             continue
@@ -42,7 +42,7 @@ def posterior_bound(problem: NavigationProblem, integers_known: bool = True) -> 
             v.R = matrix_from_quat(truth.q_nb[near])
     built = build(problem, vehicles, receivers(problem), use_phase=True)
     for data in built.links:
-        integers.start_ambiguities(data)
+        phases.prepare(data, problem.settings.ambiguity)
         if integers_known:
             data.block.amb_key[:] = 0
             data.block.renew()
@@ -52,7 +52,6 @@ def posterior_bound(problem: NavigationProblem, integers_known: bool = True) -> 
     if net is None:
         raise ValueError("the problem is singular at the truth")
     cov = JointCovariance(net)
-    ends = {v.name: v for v in vehicles}
     return grid, {
-        (p.reference, p.rover): pair_covariance(problem, ends[p.reference], ends[p.rover], cov) for p in problem.wanted_pairs
+        (p.reference, p.rover): pair_covariance(problem, pair_ends(problem, vehicles, p), cov) for p in problem.wanted_pairs
     }

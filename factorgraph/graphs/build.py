@@ -6,13 +6,15 @@ code of the reference and differences carry everything once.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
 
 from factorgraph.errors import InputError
+from factorgraph.graphs.atmosphere import absolute_codes, link_atmosphere, receiver_atmosphere
+from factorgraph.graphs.barometer import barometer_blocks
 from factorgraph.graphs.blocks import (
     CODE,
     DOPPLER,
@@ -24,7 +26,6 @@ from factorgraph.graphs.blocks import (
     Endpoint,
     GnssBlock,
     HeightBlock,
-    IonosphereBlock,
     JointBlock,
     MotionBlock,
     Offset,
@@ -32,30 +33,29 @@ from factorgraph.graphs.blocks import (
     RangeBlock,
     Rows,
 )
-from factorgraph.graphs.inertial import add_imu_factors, add_priors, motion_keys, motion_prior_rows
+from factorgraph.graphs.constraints import constraint_blocks
+from factorgraph.graphs.inertial import add_priors, motion_keys, motion_prior_rows
+from factorgraph.graphs.inertial_block import imu_block
+from factorgraph.graphs.intersystem import biases, shared_clocks, start_biases
 from factorgraph.graphs.optimizer import Graph
-from factorgraph.graphs.parameters import Parameter, Parameters
+from factorgraph.graphs.parameters import Parameters
 from factorgraph.graphs.rows import in_grid, plain_rows, sensor_end, time_offset
+from factorgraph.graphs.sensors import sensor_blocks
 from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.measurements import Tag
 from factorgraph.models.arcs import Arcs, find_arcs
 from factorgraph.models.differencing import CommonGroups
 from factorgraph.models.gnss import (
-    WAVELENGTH_L1_M,
     PairedRows,
     elevation_scale,
-    one_code_per_satellite,
     pair_rows,
     system_of,
 )
 from factorgraph.models.receivers import Receiver, corrected
 from factorgraph.problem import Antenna, Link, NavigationProblem, RangeModel
+from factorgraph.solution import ParameterEstimate
 from factorgraph.start import interpolate
 from factorgraph.types import Array, BoolArray, IntArray
-
-HEADING_SIGMA_RAD = 3.0
-HINT_SIGMA_RAD = 0.3
-HELD = 1e-6  # prior of a component that is not estimated beside one that is
 
 
 @dataclass(slots=True)
@@ -72,10 +72,17 @@ class GnssLink:
     arc_start_s: Array
     arc_end_s: Array
     state: list[str] = field(default_factory=list)  # per arc: "float", "fixed", "released", "datum"
-    slips: dict[str, int] = field(default_factory=dict)
     key_base: int = 0
     float_cyc: Array = field(default_factory=lambda: np.zeros(0))  # before fixing
     float_sigma: Array = field(default_factory=lambda: np.zeros(0))
+    cause: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (n,) why a row begins an arc: arcs.CAUSES, -1
+    half: BoolArray = field(default_factory=lambda: np.zeros(0, bool))  # (n,) flagged as ambiguous by half a cycle
+    odd: BoolArray = field(default_factory=lambda: np.zeros(0, bool))  # (n,) of an arc known to be whole in half cycles only
+    repairs: dict[int, float] = field(default_factory=dict)  # row that goes on over a slip -> sigma of its size [cyc]
+
+    def has_integer(self, arc: int) -> bool:
+        """GLONASS satellites have carriers of their own and with them delays of receivers, which no difference cancels."""
+        return self.arc_satellite[arc][0] != "R"
 
     def make_free(self, arc: int) -> None:
         """Give an arc its variable back."""
@@ -95,12 +102,14 @@ def _gnss_rows(
     group: list[str],
     azimuth_rad: Array,
     elevation_rad: Array,
+    cn0_dbhz: Array,
+    clock_index: IntArray,
 ) -> Rows:
-    """Rows already sorted by factor, kind, group."""
-    n_groups = int(group_index.max()) + 1 if len(group_index) else 1
-    clocks = CommonGroups.from_labels((factor * 3 + kind) * n_groups + group_index)
+    """Rows already sorted by factor, kind, clock, group."""
+    clocks = CommonGroups.from_labels((factor * 3 + kind) * (int(clock_index.max(initial=0)) + 1) + clock_index)
     factors = CommonGroups.from_labels(factor)
-    return Rows(kind, t_s, sigma, factors, clocks, source, label, label_index, group, group_index, azimuth_rad, elevation_rad)
+    place = (azimuth_rad, elevation_rad)
+    return Rows(kind, t_s, sigma, factors, clocks, source, label, label_index, group, group_index, *place, cn0_dbhz=cn0_dbhz)
 
 
 def _without_singles(order: IntArray, clock_label: IntArray) -> IntArray:
@@ -126,12 +135,15 @@ def link_block(
     inside = (b.stream.t_s[pairs.epoch] >= grid[0] - 0.01) & (b.stream.t_s[pairs.epoch] <= grid[-1] + 0.01)
     if not np.any(inside):
         raise InputError(_nothing_shared(link, a, b, bool(len(pairs.a))))
-    arcs, arc = _phase_arcs(problem, a, b, pairs, inside & use_phase)
-    row, kind, z, sigma = _differences(ref, rov, pairs, inside, arc)
+    arcs = _phase_arcs(problem, a, b, pairs, inside & use_phase)
+    row, kind, z, sigma = _differences(ref, rov, pairs, inside, arcs.of_row)
     # one clock per kind, signal pair and constellation: the signal pair's name begins with the constellation
-    order = np.lexsort((b.stream.sat[pairs.b[row]], pairs.group[row], kind, pairs.epoch[row]))
-    order = _without_singles(order, (pairs.epoch[row] * 3 + kind) * len(pairs.group_names) + pairs.group[row])
-    row, kind, z, sigma = row[order], kind[order], z[order], sigma[order]
+    shared = problem.settings.inter_system == "constant"
+    group, names = pairs.group[row], pairs.group_names
+    clock = shared_clocks(kind, group, names, b.stream.wavelength_m[pairs.b[row]]) if shared else group
+    order = np.lexsort((b.stream.sat[pairs.b[row]], group, clock, kind, pairs.epoch[row]))
+    order = _without_singles(order, (pairs.epoch[row] * 3 + kind) * len(names) + clock)
+    row, kind, z, sigma, clock = row[order], kind[order], z[order], sigma[order], clock[order]
     ra, rb = pairs.a[row], pairs.b[row]
     _, factor_of = np.unique(pairs.epoch[row], return_inverse=True)
     first = CommonGroups.from_labels(factor_of).start
@@ -148,9 +160,12 @@ def link_block(
         group=list(pairs.group_names),
         azimuth_rad=rov.prepared.azimuth_rad[rb],
         elevation_rad=rov.prepared.elevation_rad[rb],
+        cn0_dbhz=np.fmin(a.stream.cn0_dbhz[ra], b.stream.cn0_dbhz[rb]),
+        clock_index=clock,
     )
+    constant, bias_of = biases(kind, pairs.group[row], clock, names, rows.source, parameters) if shared else ([], clock)
     arc_row = np.full(len(row), -1, np.int64)
-    arc_row[kind == PHASE] = np.unique(arc[row][kind == PHASE], return_inverse=True)[1]
+    arc_row[kind == PHASE] = np.unique(arcs.of_row[row][kind == PHASE], return_inverse=True)[1]
     rover = antenna_end(ends[link.rover], t_rover, rov, parameters)
     reference = antenna_end(ends[link.reference], t_ref, ref, parameters)
     block = GnssBlock(
@@ -166,10 +181,16 @@ def link_block(
         wavelength_m=b.stream.wavelength_m[rb],
         arc=arc_row,
         place_n=None if ref.vehicle.is_fixed else reference.vehicle.points(reference.query).r_n,
+        biases=constant,
+        bias_of=bias_of,
+        clock_index=clock,
     )
     none = np.zeros(0)
-    data = GnssLink(link, block, ra, rb, none.astype(np.int64), [], [], none, none, slips=arcs.slips, key_base=key_base)
+    data = GnssLink(link, block, ra, rb, none.astype(np.int64), [], [], none, none, key_base=key_base)
+    data.cause, data.half = np.where(kind == PHASE, arcs.cause[row], -1), arcs.half[row]
+    data.odd = np.zeros(len(row), bool)
     describe_arcs(data)
+    start_biases(block)
     return data
 
 
@@ -191,17 +212,10 @@ def _nothing_shared(link: Link, a: Antenna, b: Antenna, have_rows: bool) -> str:
     return f"link {link.reference}-{link.rover}: {what} ({', '.join(spans)} after t0); check that the files are of one flight"
 
 
-def _phase_arcs(
-    problem: NavigationProblem, a: Antenna, b: Antenna, pairs: PairedRows, wanted: BoolArray
-) -> tuple[Arcs, IntArray]:
-    """Arcs of the paired rows, and per row its arc or -1 where the phase is missing, unfit for integers or the arc too short."""
-    settings = problem.settings.ambiguity
-    glonass = np.char.startswith(np.array(b.stream.satellites)[b.stream.sat[pairs.b]], "R")
-    half_cycle = ((a.stream.lli[pairs.a] | b.stream.lli[pairs.b]) & 2) > 0
+def _phase_arcs(problem: NavigationProblem, a: Antenna, b: Antenna, pairs: PairedRows, wanted: BoolArray) -> Arcs:
+    """Arcs of the paired rows, of any length."""
     finite = np.isfinite(a.stream.phase_cyc[pairs.a]) & np.isfinite(b.stream.phase_cyc[pairs.b])
-    arcs = find_arcs(a.stream, b.stream, pairs, finite & ~glonass & ~half_cycle & wanted, settings)
-    length = np.bincount(arcs.of_row[arcs.of_row >= 0], minlength=arcs.count + 1)
-    return arcs, np.where((arcs.of_row >= 0) & (length[arcs.of_row] >= settings.min_arc_epochs), arcs.of_row, -1)
+    return find_arcs(a.stream, b.stream, pairs, finite & wanted, problem.settings.ambiguity)
 
 
 def _differences(
@@ -273,36 +287,41 @@ def describe_arcs(data: GnssLink) -> None:
     data.arc_signal = [block.rows.group[g] for g in data.arc_group]
     data.arc_start_s, data.arc_end_s = block.rows.t_s[first], block.rows.t_s[last]
     block.amb_key = np.array([gtsam.symbol("a", data.key_base + i) for i in range(n)], np.int64)
-    block.amb_value = np.zeros(n)
-    data.state = ["float"] * n
+    block.amb_value, block.amb_unit_cyc = np.zeros(n), np.ones(n)
+    data.state, data.float_cyc, data.float_sigma = ["float"] * n, np.zeros(0), np.zeros(0)
 
 
-def absolute_block(
-    problem: NavigationProblem, end: VehicleVariables, rx: Receiver, parameters: Parameters
-) -> GnssBlock | None:
+def absolute_block(problem: NavigationProblem, end: VehicleVariables, rx: Receiver, parameters: Parameters) -> GnssBlock | None:
     """Undifferenced code (one signal per satellite) and Doppler of a moving receiver."""
     antenna = rx.antenna
     stream, noise = antenna.stream, antenna.noise
     grid = end.t_s
-    rows = one_code_per_satellite(stream, rx.usable)
+    rows, code, noisier = absolute_codes(problem.settings, rx)
     t = rx.prepared.t_s[rows]
-    rows = rows[(t >= grid[0] - 0.01) & (t <= grid[-1] + 0.01)]
+    inside = (t >= grid[0] - 0.01) & (t <= grid[-1] + 0.01)
+    rows, code, noisier = rows[inside], code[inside], noisier[inside]
     rate_ok = np.isfinite(rx.prepared.rate_mps[rows]) & np.all(np.isfinite(rx.prepared.sat_vel_n[rows]), axis=1)
     parts = [
-        (rows, np.full(len(rows), CODE), rx.prepared.code_m[rows]),
-        (rows[rate_ok], np.full(int(rate_ok.sum()), DOPPLER), rx.prepared.rate_mps[rows[rate_ok]]),
+        (rows, np.full(len(rows), CODE), code, noisier),
+        (rows[rate_ok], np.full(int(rate_ok.sum()), DOPPLER), rx.prepared.rate_mps[rows[rate_ok]], np.ones(int(rate_ok.sum()))),
     ]
-    row, kind, z = (np.concatenate([p[i] for p in parts]) for i in range(3))
+    row, kind, z, noisier = (np.concatenate([p[i] for p in parts]) for i in range(4))
     letters, system = np.unique(system_of(stream)[row], return_inverse=True)
-    order = np.lexsort((stream.sat[row], system, kind, stream.epoch[row]))
-    order = _without_singles(order, (stream.epoch[row] * 3 + kind) * max(len(letters), 1) + system)
-    row, kind, z, system = row[order], kind[order], z[order], system[order]
+    shared = problem.settings.inter_system == "constant"
+    clock = np.zeros_like(system) if shared else system
+    order = np.lexsort((stream.sat[row], system, clock, kind, stream.epoch[row]))
+    order = _without_singles(order, (stream.epoch[row] * 3 + kind) * max(len(letters), 1) + clock)
+    row, kind, z, system, clock = row[order], kind[order], z[order], system[order], clock[order]
+    noisier = noisier[order]
     if not len(row):
         return None
     interval = float(np.median(np.diff(stream.t_s))) if len(stream.t_s) > 1 else 1.0
     persist = np.sqrt(max(1.0, noise.absolute_correlation_s / interval))
     scale = elevation_scale(rx.prepared.elevation_rad[row], noise.elevation)
-    sigma = np.where(kind == CODE, noise.absolute_code_m * persist, noise.doppler_mps) * scale
+    persistence = np.where(kind == CODE, persist, 1.0)
+    # what a combination amplifies is the code's own noise, not what persists
+    own_code = np.hypot(noise.absolute_code_m, noise.code_m * np.sqrt(noisier**2 - 1))
+    sigma = np.where(kind == CODE, own_code, noise.doppler_mps) * scale * persistence
     _, factor_of = np.unique(stream.epoch[row], return_inverse=True)
     first = np.concatenate([[0], np.flatnonzero(np.diff(factor_of)) + 1])
     times = rx.prepared.t_s[row[first]]
@@ -318,9 +337,13 @@ def absolute_block(
         group=[str(s) for s in letters],
         azimuth_rad=rx.prepared.azimuth_rad[row],
         elevation_rad=rx.prepared.elevation_rad[row],
+        cn0_dbhz=stream.cn0_dbhz[row],
+        clock_index=clock,
     )
+    constant, bias_of = biases(kind, system, clock, letters.tolist(), end.name, parameters) if shared else ([], clock)
+    table.persistence = persistence
     zero = np.zeros((len(row), 3))
-    return GnssBlock(
+    block = GnssBlock(
         table,
         rover=antenna_end(end, times, rx, parameters),
         reference=None,
@@ -332,7 +355,12 @@ def absolute_block(
         vel_reference=zero,
         wavelength_m=stream.wavelength_m[row],
         arc=np.full(len(row), -1, np.int64),
+        biases=constant,
+        bias_of=bias_of,
+        clock_index=clock,
     )
+    start_biases(block)
+    return block
 
 
 def position_blocks(end: VehicleVariables, parameters: Parameters) -> list[Block]:
@@ -354,10 +382,12 @@ def position_blocks(end: VehicleVariables, parameters: Parameters) -> list[Block
             )
             at = sensor_end(end, p.t_s[ok], p.lever_b, f"{vehicle.name}/{p.name}", p.calibration, parameters)
             blocks.append(PositionBlock(rows, end=at, z_n=p.r_n[ok]))
-    for h in vehicle.heights:
+    for i, h in enumerate(vehicle.heights):
         ok = in_grid(h.t_s, end.t_s, h.calibration.time_s) & np.isfinite(h.up_m) & end.is_carried(h.t_s)
         n = int(ok.sum())
-        if n:
+        if n and h.calibration.bias_walk > 0:
+            blocks += barometer_blocks(end, h, ok, i, parameters)
+        elif n:
             name = f"{vehicle.name}/{h.name}"
             at = sensor_end(end, h.t_s[ok], h.lever_b, name, h.calibration, parameters)
             rows = plain_rows(HEIGHT, h.t_s[ok], h.sigma_m[ok], at.query.k, name, ["U"], np.zeros(n, np.int64))
@@ -408,18 +438,11 @@ def range_blocks(model: RangeModel, ends: dict[str, VehicleVariables], parameter
                 b=other,
                 anchor_n=None if other is not None else anchor[tb],
                 z_m=stream.range_m[rows],
-                parameter=_range_parameter(model, what, parameters),
+                bias=parameters.scalar(f"{what} bias", "m", model.bias_sigma_m),
+                scale=parameters.scalar(f"{what} scale", "1", model.scale_sigma),
             )
         )
     return blocks
-
-
-def _range_parameter(model: RangeModel, what: str, parameters: Parameters) -> Parameter | None:
-    """Bias and scale of ranges; what is not estimated is held by its prior."""
-    if model.bias_sigma_m == 0 and model.scale_sigma == 0:
-        return None
-    sigma = np.array([max(model.bias_sigma_m, HELD), max(model.scale_sigma, 1e-3 * HELD)])
-    return parameters.add(what, ("bias", "scale"), "m", np.zeros(2), sigma)
 
 
 def _ranged(
@@ -446,49 +469,24 @@ def motion_block(vehicle: VehicleVariables) -> MotionBlock:
     return MotionBlock(rows, vehicle=vehicle, keys_of=[motion_keys(vehicle, k) for k in range(n)], L=L, J0=J)
 
 
-def joint_block(a: VehicleVariables, b: VehicleVariables) -> JointBlock:
-    """Rows without information that keep two vehicles' states of one time in one clique, so that their covariance is at hand."""
-    n = len(a.t_s)
-    rows = plain_rows(-1, a.t_s, np.ones(n), np.arange(n), f"{a.name}-{b.name}", ["joint"], np.zeros(n, np.int64))
-    return JointBlock(rows, a=a, b=b)
+def joint_blocks(pairs: Iterable[tuple[VehicleVariables, VehicleVariables]]) -> list[JointBlock]:
+    """Rows without information that keep the states of one time in one clique, so that the covariance of pairs is at hand.
 
-
-def add_ionosphere(problem: NavigationProblem, data: GnssLink, baseline_m: float) -> IonosphereBlock | None:
-    """Give a long link's code and phase rows a differential ionosphere per satellite and time step.
-
-    Vertical at L1, scaled by the obliquity 1 + 16 (0.53 - el)^3 (el in semicircles) and (lambda / lambda_L1)^2, with plus
-    sign for code and minus for phase. Source: IS-GPS-200, 20.3.3.5.2.5, for the obliquity.
+    One block per set of moving vehicles that pairs connect.
     """
-    settings, block = problem.settings, data.block
-    if settings.ionosphere_ppm == 0 or baseline_m < settings.ionosphere_min_baseline_m:
-        return None
-    rows = block.rows
-    sign = np.select([rows.kind == CODE, rows.kind == PHASE], [1.0, -1.0], 0.0)
-    obliquity = 1 + 16 * (0.53 - rows.elevation_rad / np.pi) ** 3
-    step = np.floor((rows.t_s - rows.t_s[0]) / settings.ionosphere_step_s).astype(np.int64)
-    label = rows.label_index * (int(step.max()) + 1) + step
-    used, index = np.unique(label[sign != 0], return_inverse=True)
-    block.iono = np.full(block.n, -1, np.int64)
-    block.iono[sign != 0] = index
-    block.iono_scale = sign * obliquity * (block.wavelength_m / WAVELENGTH_L1_M) ** 2
-    block.iono_key = np.array([gtsam.symbol("i", data.key_base + k) for k in range(len(used))], np.int64)
-    block.iono_value = np.zeros(len(used))
-    sat, at = used // (int(step.max()) + 1), used % (int(step.max()) + 1)
-    follows = np.concatenate([[False], sat[1:] == sat[:-1]])
-    sigma = settings.ionosphere_ppm * 1e-6 * baseline_m
-    gap_s = np.concatenate([[0], np.diff(at)]) * settings.ionosphere_step_s
-    sigmas = np.where(follows, sigma * np.sqrt(np.maximum(gap_s, 1.0) / settings.ionosphere_correlation_s), sigma)
-    n = len(used)
-    table = plain_rows(
-        -1,
-        rows.t_s[0] + at * settings.ionosphere_step_s,
-        sigmas,
-        np.arange(n),
-        rows.source,
-        ["ionosphere"],
-        np.zeros(n, np.int64),
-    )
-    return IonosphereBlock(table, of=block, previous=np.where(follows, np.arange(n) - 1, -1))
+    sets: list[dict[int, VehicleVariables]] = []
+    for a, b in pairs:
+        if a is not b and a.mode != "fixed" and b.mode != "fixed":
+            met = [s for s in sets if a.index in s or b.index in s]
+            sets = [s for s in sets if s not in met]
+            sets.append({k: v for s in (*met, {a.index: a, b.index: b}) for k, v in s.items()})
+    blocks = []
+    for s in sets:
+        vehicles = tuple(s.values())
+        t, name = vehicles[0].t_s, "-".join(v.name for v in vehicles)
+        rows = plain_rows(-1, t, np.ones(len(t)), np.arange(len(t)), name, ["joint"], np.zeros(len(t), np.int64))
+        blocks.append(JointBlock(rows, vehicles=vehicles))
+    return blocks
 
 
 @dataclass(slots=True)
@@ -498,16 +496,16 @@ class Built:
     graph: Graph
     links: list[GnssLink]
     receivers: dict[str, Receiver]
-    ends: dict[str, VehicleVariables]
+    ends: dict[str, VehicleVariables]  # carried antennas: the vehicle that carries them
+    noise: list[ParameterEstimate] = field(default_factory=list)  # found from residuals
 
 
 def native_factors(graph: Graph) -> None:
-    """(Re)build the native factors: IMU at the current bias, priors, parameter priors."""
+    """(Re)build the native factors, priors of states and parameters; IMUs are preintegrated at the current biases from now on."""
     graph.native = gtsam.NonlinearFactorGraph()
     for v in graph.vehicles:
-        if v.mode == "imu":
-            add_imu_factors(graph.native, v)
-        add_priors(graph.native, v, HINT_SIGMA_RAD if v.vehicle.heading_hint_rad is not None else HEADING_SIGMA_RAD)
+        v.preintegrated_bias = v.bias.copy()
+        add_priors(graph.native, v)
     graph.native.push_back(graph.parameters.priors())
 
 
@@ -520,8 +518,10 @@ def build(
 ) -> Built:
     """All blocks and native factors for variables that already hold start values."""
     ends = {v.name: v for v in vehicles}
+    antennas = ends | {v.name: ends[v.carrier] for v in problem.vehicles if v.carrier is not None}
     graph = Graph(vehicles, [], gtsam.NonlinearFactorGraph())
     for end in vehicles:
+        end.preintegrated_bias = end.bias.copy()
         if end.mode == "imu":
             end.imu_offset = graph.parameters.scalar(f"{end.name}/imu time offset", "s", end.vehicle.imu_calibration.time_s)
     links: list[GnssLink] = []
@@ -529,20 +529,22 @@ def build(
     key_base = 0
     absolute: list[Block] = []
     for link in problem.links:
-        if link.reference in rx and link.rover in rx:
-            data = link_block(problem, link, ends, rx, key_base, use_phase, graph.parameters)
+        a, b = antennas[link.reference], antennas[link.rover]
+        if link.reference in rx and link.rover in rx and (a is not b or a.mode == "imu"):
+            data = link_block(problem, link, antennas, rx, key_base, use_phase, graph.parameters)
             key_base += 1_000_000
             links.append(data)
             graph.gnss.append(data.block)
-            apart = float(np.linalg.norm(ends[link.rover].r - ends[link.reference].r, axis=1).max())
-            ionosphere = add_ionosphere(problem, data, apart) if use_phase else None
-            if ionosphere is not None:
-                absolute.append(ionosphere)
+            if use_phase:
+                absolute += link_atmosphere(problem, data.block, data.key_base, a, b)
     for v in problem.vehicles:
         if v.name in rx and v.name not in rovers and not v.is_fixed and problem.settings.use_absolute and not v.positions:
-            block = absolute_block(problem, ends[v.name], rx[v.name], graph.parameters)
+            block = absolute_block(problem, antennas[v.name], rx[v.name], graph.parameters)
             if block is not None:
                 absolute.append(block)
+                if use_phase:
+                    key_base += 1_000_000
+                    absolute += receiver_atmosphere(problem, block, key_base, antennas[v.name])
     others: list[Block] = []
     for model in problem.ranges:
         others += range_blocks(model, ends, graph.parameters)
@@ -550,12 +552,14 @@ def build(
         others += position_blocks(end, graph.parameters)
         if end.mode == "motion":
             others.append(motion_block(end))
-    for pair in problem.wanted_pairs:
-        both = [ends[pair.reference], ends[pair.rover]]
-        if all(end.mode != "fixed" for end in both):
-            graph.joints.append(joint_block(both[0], both[1]))
+        inertial = imu_block(end, graph.parameters)
+        if inertial is not None:
+            others.append(inertial)
+    others += sensor_blocks(problem, ends, graph.parameters)
+    others += constraint_blocks(problem, ends, graph.parameters)
+    graph.joints += joint_blocks((antennas[p.reference], antennas[p.rover]) for p in problem.wanted_pairs)
     graph.blocks = [*graph.gnss, *absolute, *others]
     progress(0.5)
     native_factors(graph)
     progress(1.0)
-    return Built(graph, links, rx, ends)
+    return Built(graph, links, rx, antennas)

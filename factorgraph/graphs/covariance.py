@@ -8,6 +8,9 @@ where Sigma_SS consists of blocks that are known already, since the separators o
 Conditionals that share their separator are treated as one: split into single variables (a velocity given two
 positions, say) the gains R^-1 S exceed one and rounding errors grow along a chain; joined they are smoother gains.
 
+The covariance of a few variables anywhere in the net needs no more than the conditionals on their paths to its end: with
+R^T Y = E, E the unit columns of the variables, it is Y^T Y.
+
 Source: Takahashi et al. (1973); Kaess and Dellaert (2009), Covariance recovery from a square root information matrix.
 """
 
@@ -50,12 +53,13 @@ def _fetch(va, vb, dim, node_of, row_of, var_first, var, size, out, out_first, t
 
 
 @njit(cache=True)
-def _selected_inverse(dim, node_of, row_of, var_first, var, size, RS, out, out_first):  # type: ignore[no-untyped-def]
+def _selected_inverse(dim, node_of, row_of, var_first, var, size, out, out_first):  # type: ignore[no-untyped-def]
+    """Put [Sigma_FF Sigma_FS] of every node in the place of its [R S]."""
     for n in range(len(size)):
         d = size[n]
         total = (out_first[n + 1] - out_first[n]) // d
         w = total - d
-        block = RS[out_first[n] : out_first[n + 1]].reshape(d, total)
+        block = out[out_first[n] : out_first[n + 1]].reshape(d, total)
         Ri = np.linalg.inv(np.ascontiguousarray(block[:, :d]))
         result = np.zeros((d, total))
         result[:, :d] = Ri @ Ri.T
@@ -103,17 +107,71 @@ def _joints(groups, dim, node_of, row_of, var_first, var, size, out, out_first, 
                 target[g, a, b] = target[g, b, a]
 
 
+@njit(cache=True)
+def _path_covariance(dim, at, unit, parent_first, parent, block_first, blocks):  # type: ignore[no-untyped-def]
+    """Y^T Y for R^T Y = E: variables of dimension dim[i] at rows at[i], E rows unit[i]; blocks hold [R S] of each."""
+    m = unit.shape[1]
+    pending = unit.copy()
+    P = np.zeros((m, m))
+    for i in range(len(dim)):
+        d = dim[i]
+        block = blocks[block_first[i] : block_first[i + 1]].reshape(d, -1)
+        y = np.linalg.solve(np.ascontiguousarray(block[:, :d].T), pending[at[i] : at[i] + d])
+        P += y.T @ y
+        col = d
+        for k in range(parent_first[i], parent_first[i + 1]):
+            p = parent[k]
+            pending[at[p] : at[p] + dim[p]] -= np.ascontiguousarray(block[:, col : col + dim[p]].T) @ y
+            col += dim[p]
+    return P
+
+
+def covariance_of(net: gtsam.GaussianBayesNet, keys: Sequence[int]) -> Array:
+    """Joint covariance (d, d) of any variables of a net, in the order of `keys`.
+
+    Costs a path to the end of the net for each, so it is meant for few of them or a net whose paths are short.
+    """
+    wanted = set(keys)
+    index: dict[int, int] = {}
+    dims: list[int] = []
+    parents: list[list[int]] = []
+    blocks: list[Array] = []
+    for i in range(net.size()):
+        conditional = net.at(i)
+        own, *others = (int(k) for k in conditional.keys())
+        if own in wanted:
+            index[own] = len(dims)
+            wanted.update(others)
+            dims.append(conditional.R().shape[0])
+            parents.append(others)
+            blocks.append(np.hstack([conditional.R(), conditional.S()]).ravel())
+    dim = np.array(dims, np.int64)
+    at = np.concatenate([[0], np.cumsum(dim)]).astype(np.int64)
+    columns = np.concatenate([np.arange(at[index[k]], at[index[k] + 1]) for k in keys])
+    unit = np.zeros((at[-1], len(columns)))
+    unit[columns, np.arange(len(columns))] = 1.0
+    lengths = [len(p) for p in parents]
+    return np.asarray(
+        _path_covariance(
+            dim,
+            at,
+            unit,
+            np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+            np.array([index[k] for others in parents for k in others], np.int64),
+            np.concatenate([[0], np.cumsum([b.size for b in blocks])]).astype(np.int64),
+            np.concatenate(blocks),
+        )
+    )
+
+
 class JointCovariance:
     """Covariance blocks of variables that share a factor (or fill-in) in the eliminated graph."""
 
     def __init__(self, net: gtsam.GaussianBayesNet) -> None:
         n = net.size()
-        conditionals = [net.at(i) for i in range(n)]
-        keys = [c.keys() for c in conditionals]
-        R = [c.R() for c in conditionals]
-        S = [c.S() for c in conditionals]
+        keys = [net.at(i).keys() for i in range(n)]
         self.index = {k[0]: i for i, k in enumerate(keys)}
-        self.dim = np.array([r.shape[0] for r in R], np.int64)
+        self.dim = np.array([net.at(i).R().shape[0] for i in range(n)], np.int64)
         parents = [sorted(self.index[k] for k in ks[1:]) for ks in keys]
         # node of a variable: that of its first parent when both share the remaining separator
         leader = np.arange(n)
@@ -125,48 +183,29 @@ class JointCovariance:
             members.setdefault(int(leader[i]), []).append(i)
         order = sorted(members, reverse=True)
         self.node_of, self.row_of = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        variables: list[int] = []
-        var_first, out_first, size, blocks = [0], [0], [], []
+        columns = [[*members[lead], *parents[lead]] for lead in order]
+        self.size = np.array([self.dim[members[lead]].sum() for lead in order], np.int64)
+        self.var = np.array([v for each in columns for v in each], np.int64)
+        self.var_first = np.concatenate([[0], np.cumsum([len(each) for each in columns])]).astype(np.int64)
+        widths = np.array([self.dim[each].sum() for each in columns], np.int64)
+        self.out_first = np.concatenate([[0], np.cumsum(self.size * widths)]).astype(np.int64)
+        self.out = np.zeros(self.out_first[-1])
         for node, lead in enumerate(order):
-            own = members[lead]
-            separator = parents[lead]
-            columns = [*own, *separator]
-            at, edge = {}, 0
-            for v in columns:
-                at[v] = edge
-                edge += int(self.dim[v])
-            d = sum(int(self.dim[v]) for v in own)
-            RS = np.zeros((d, edge))
-            for v in own:
+            block = self.out[self.out_first[node] : self.out_first[node + 1]].reshape(-1, widths[node])
+            edges = np.cumsum([0, *self.dim[columns[node]]]).tolist()
+            at = dict(zip(columns[node], edges, strict=False))
+            for v in members[lead]:
                 self.node_of[v], self.row_of[v] = node, at[v]
+                conditional = net.at(v)
                 rows = slice(at[v], at[v] + int(self.dim[v]))
-                RS[rows, rows] = R[v]
-                col = 0
+                block[rows, rows] = conditional.R()
+                S, col = conditional.S(), 0
                 for k in keys[v][1:]:
                     p = self.index[k]
                     width = int(self.dim[p])
-                    RS[rows, at[p] : at[p] + width] = S[v][:, col : col + width]
+                    block[rows, at[p] : at[p] + width] = S[:, col : col + width]
                     col += width
-            variables += columns
-            var_first.append(len(variables))
-            out_first.append(out_first[-1] + RS.size)
-            size.append(d)
-            blocks.append(RS.ravel())
-        self.var = np.array(variables, np.int64)
-        self.var_first, self.out_first = np.array(var_first, np.int64), np.array(out_first, np.int64)
-        self.size = np.array(size, np.int64)
-        self.out = np.zeros(self.out_first[-1])
-        _selected_inverse(
-            self.dim,
-            self.node_of,
-            self.row_of,
-            self.var_first,
-            self.var,
-            self.size,
-            np.concatenate(blocks),
-            self.out,
-            self.out_first,
-        )
+        _selected_inverse(self.dim, self.node_of, self.row_of, self.var_first, self.var, self.size, self.out, self.out_first)
 
     def block(self, a: int, b: int) -> Array:
         """Covariance of keys a and b (d_a, d_b); NaN where the graph does not join them in one clique."""

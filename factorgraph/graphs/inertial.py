@@ -1,9 +1,4 @@
-"""What connects a vehicle's states in time: native IMU factors, or a continuous-time motion prior.
-
-GTSAM adds Coriolis and centrifugal terms of the position relative to the frame's origin; gravity of every interval is
-therefore gravitation at its middle plus the centrifugal acceleration of the origin.
-
-An interval that IMU samples are missing from keeps its factor, with noise that leaves the vehicle all but free.
+"""Priors of a vehicle's first state, and the continuous-time motion prior that connects its states where it has no IMU.
 
 The motion prior is white noise on acceleration (constant velocity in the mean), exact between states:
 
@@ -16,49 +11,20 @@ import gtsam
 import numpy as np
 
 from factorgraph.graphs.variables import VehicleVariables, key
-from factorgraph.models.preintegration import crossing, gtsam_inputs
 from factorgraph.types import Array
 
-GAP_GYRO, GAP_ACCEL = 0.3, 10.0  # rad/s and m/s^2 per sqrt(Hz)
-INTEGRATION_SIGMA_M = 3e-4  # per sqrt(s): keeps the position pivots of the Cholesky elimination well conditioned
 
-
-def add_imu_factors(graph: gtsam.NonlinearFactorGraph, vehicle: VehicleVariables) -> None:
-    """One CombinedImuFactor per grid interval, preintegrated at the vehicle's current bias."""
-    noise = vehicle.vehicle.imu_noise
-    t, K = vehicle.t_s, len(vehicle.t_s)
-    vehicle.preintegrated_bias = vehicle.bias.copy()
-    inputs = gtsam_inputs(vehicle.imu, t[:-1], t[1:], vehicle.bias[:-1])
-    missing = crossing(vehicle.gaps_s, t[:-1], t[1:])
-    middle = vehicle.r[:-1] + 0.5 * vehicle.v[:-1] * np.diff(t)[:, None]
-    gravity = vehicle.frame.gravitation(middle) + vehicle.origin_centrifugal()
-    w_ie, eye = vehicle.frame.w_ie_n, np.eye(3)
-    gyro, accel = eye * noise.gyro_rps_rthz**2, eye * noise.accel_mps2_rthz**2
-    gyro_walk, accel_walk = eye * noise.gyro_bias_walk_rps_rts**2, eye * noise.accel_bias_walk_mps2_rts**2
-    for k in range(K - 1):
-        params = gtsam.PreintegrationCombinedParams(gravity[k])
-        params.setOmegaCoriolis(w_ie)
-        params.setGyroscopeCovariance(eye * GAP_GYRO**2 if missing[k] else gyro)
-        params.setAccelerometerCovariance(eye * GAP_ACCEL**2 if missing[k] else accel)
-        params.setIntegrationCovariance(eye * INTEGRATION_SIGMA_M**2)
-        params.setBiasOmegaCovariance(gyro_walk)
-        params.setBiasAccCovariance(accel_walk)
-        bias = gtsam.imuBias.ConstantBias(vehicle.bias[k, 3:], vehicle.bias[k, :3])
-        pim = gtsam.PreintegratedCombinedMeasurements(params, bias)
-        for i in range(inputs.first[k], inputs.first[k + 1]):
-            pim.integrateMeasurement(inputs.f_b[i], inputs.w_b[i], inputs.dt_s[i])
-        a, b = vehicle.keys(k), vehicle.keys(k + 1)
-        graph.add(gtsam.CombinedImuFactor(a[0], a[1], b[0], b[1], a[2], b[2], pim))
-
-
-def add_priors(graph: gtsam.NonlinearFactorGraph, vehicle: VehicleVariables, heading_sigma_rad: float) -> None:
-    """Weak priors on the first state that make the problem determinate, and the bias prior of the IMU's grade."""
+def add_priors(graph: gtsam.NonlinearFactorGraph, vehicle: VehicleVariables) -> None:
+    """Priors on the first state: attitude as alignment knows it, the rest weak; and the bias prior of the IMU's grade."""
     sigmas = gtsam.noiseModel.Diagonal.Sigmas
     if vehicle.mode == "imu":
         noise = vehicle.vehicle.imu_noise
         x, v, b = vehicle.keys(0)
-        pose = gtsam.Pose3(gtsam.Rot3(vehicle.R[0]), vehicle.r[0])
-        graph.add(gtsam.PriorFactorPose3(x, pose, sigmas(np.array([1.0, 1.0, heading_sigma_rad, 1e3, 1e3, 1e3]))))
+        C_nb, sigma_rad = vehicle.attitude_prior
+        pose = gtsam.Pose3(gtsam.Rot3(C_nb), vehicle.r[0])
+        P = np.diag([0.0] * 3 + [1e6] * 3)
+        P[:3, :3] = C_nb.T @ np.diag(sigma_rad**2) @ C_nb
+        graph.add(gtsam.PriorFactorPose3(x, pose, gtsam.noiseModel.Gaussian.Covariance(P)))
         graph.add(gtsam.PriorFactorVector(v, vehicle.v[0], sigmas(np.full(3, 100.0))))
         bias = np.array([noise.accel_bias_mps2] * 3 + [noise.gyro_bias_rps] * 3)
         graph.add(gtsam.PriorFactorConstantBias(b, gtsam.imuBias.ConstantBias(), sigmas(bias)))

@@ -13,35 +13,60 @@ import gtsam
 import numpy as np
 
 from ambiguity import partial
+from factorgraph.graphs import switches
 from factorgraph.graphs.blocks import CODE, PHASE, GnssBlock
-from factorgraph.graphs.build import GnssLink, describe_arcs
-from factorgraph.graphs.optimizer import DIMENSION, Graph
-from factorgraph.graphs.parameters import LETTERS
-from factorgraph.models.arcs import split_at_steps
+from factorgraph.graphs.build import GnssLink
+from factorgraph.graphs.covariance import covariance_of
+from factorgraph.graphs.intersystem import start_biases
+from factorgraph.graphs.optimizer import Graph
 from factorgraph.problem import AmbiguitySettings
 from factorgraph.types import Array, IntArray
 
+GROUP = 150  # ambiguities that are fixed jointly at most: the decorrelation costs the cube of their number
 
-def connected_arcs(block: GnssBlock) -> IntArray:
-    """Component (arcs,) of every arc: arcs observed in one clock group at one epoch belong together."""
-    n = len(block.amb_key)
-    parent = np.arange(n)
 
-    def root(i: int) -> int:
+class _Sets:
+    """Disjoint sets of 0 to n - 1."""
+
+    def __init__(self, n: int) -> None:
+        self.parent = np.arange(n)
+
+    def root(self, i: int) -> int:
+        parent = self.parent
         while parent[i] != i:
             parent[i] = parent[parent[i]]
             i = int(parent[i])
         return i
 
+    def join(self, a: int, b: int) -> bool:
+        """Make the sets of a and b one; False where they are already."""
+        a, b = self.root(a), self.root(b)
+        self.parent[b] = a
+        return a != b
+
+
+def datum_arcs(component: IntArray, group: IntArray, order: IntArray) -> list[int]:
+    """Arcs whose integers may be chosen, the first in `order` that do: one per set of arcs that meet and, within it, one more
+    per group that shares the set's clock by a bias of its own.
+
+    All integers of group g in component k may change by c_k + b_g, which clocks and biases take up: as many as a spanning
+    forest of the graph that has components and groups as nodes and arcs as edges.
+    """
+    sets = _Sets(len(component) + int(group.max(initial=-1)) + 1)
+    return [int(arc) for arc in order if sets.join(int(component[arc]), len(component) + int(group[arc]))]
+
+
+def connected_arcs(block: GnssBlock) -> IntArray:
+    """Component (arcs,) of every arc: arcs observed under one clock at one epoch belong together."""
+    n = len(block.amb_key)
+    sets = _Sets(n)
     rows = np.flatnonzero((block.arc >= 0) & block.active)
     assert block.rows.clocks is not None
     clock = block.rows.clocks.of_row[rows]
     arc = block.arc[rows]
     for i in np.flatnonzero(clock[1:] == clock[:-1]):
-        a, b = root(int(arc[i])), root(int(arc[i + 1]))
-        if a != b:
-            parent[b] = a
-    return np.array([root(i) for i in range(n)], np.int64)
+        sets.join(int(arc[i]), int(arc[i + 1]))
+    return np.array([sets.root(i) for i in range(n)], np.int64)
 
 
 def start_ambiguities(data: GnssLink) -> None:
@@ -62,35 +87,22 @@ def start_ambiguities(data: GnssLink) -> None:
     with np.errstate(invalid="ignore"):
         clock = total / np.where(weight > 0, weight, np.nan)
     phase = np.flatnonzero(block.arc >= 0)
-    cycles = (block.y[phase] - clock[label[phase]]) / block.wavelength_m[phase]
+    units = (block.y[phase] - clock[label[phase]]) / block.unit_m(phase)
     for arc in range(n):
-        mine = cycles[block.arc[phase] == arc]
+        mine = units[block.arc[phase] == arc]
         mine = mine[np.isfinite(mine)]
         block.amb_value[arc] = np.median(mine) if len(mine) else 0.0
     length = np.bincount(block.arc[phase], minlength=n)
     component = connected_arcs(block)
-    for c in np.unique(component):
-        members = np.flatnonzero(component == c)
-        datum = int(members[np.argmax(length[members])])
-        block.amb_value[members] -= block.amb_value[datum] - np.round(block.amb_value[datum])
+    # relative to an arc of half cycles, whole ones would be no integers
+    for datum in datum_arcs(component, data.arc_group, np.lexsort((-length, -block.amb_unit_cyc))):
+        members = np.flatnonzero((component == component[datum]) & (data.arc_group == data.arc_group[datum]))
+        off_cyc = block.amb_unit_cyc[datum] * (block.amb_value[datum] - np.round(block.amb_value[datum]))
+        block.amb_value[members] -= off_cyc / block.amb_unit_cyc[members]
         block.amb_key[datum] = 0
         data.state[datum] = "datum"
+    start_biases(block)
     block.renew()
-
-
-def split_slipped(data: GnssLink, settings: AmbiguitySettings) -> int:
-    """Split arcs whose residuals step (slips that no detector saw); all ambiguities start anew. Returns the splits."""
-    block = data.block
-    block.predict()
-    res = block.residuals()
-    lam = block.wavelength_m
-    new, split = split_at_steps(res, block.rows.sigma, block.arc, block.rows.t_s, 0.3 * lam, settings.min_arc_epochs)
-    if split:
-        block.arc = new
-        describe_arcs(data)
-        data.slips["residual step"] = data.slips.get("residual step", 0) + split
-        start_ambiguities(data)
-    return split
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,35 +114,10 @@ class FixRound:
     success_rate: float
 
 
-def tail_covariance(net: gtsam.GaussianBayesNet, keys: list[int]) -> Array:
-    """Covariance of variables that were eliminated last: R of the net's tail, inverted. `keys` scalar variables."""
-    n = net.size()
-    tail = []
-    for i in range(n - 1, -1, -1):
-        c = net.at(i)
-        if chr(gtsam.symbolChr(c.keys()[0])) not in ("a", *LETTERS.values()):
-            break
-        tail.append(c)
-    tail.reverse()
-    index: dict[int, int] = {}
-    size = 0
-    for c in tail:
-        index[c.keys()[0]] = size
-        size += c.R().shape[0]
-    R = np.zeros((size, size))
-    for c in tail:
-        own, *parents = c.keys()
-        i, d = index[own], c.R().shape[0]
-        R[i : i + d, i : i + d] = c.R()
-        S, col = c.S(), 0
-        for p in parents:
-            width = DIMENSION[chr(gtsam.symbolChr(p))]
-            R[i : i + d, index[p] : index[p] + width] = S[:, col : col + width]
-            col += width
-    Ri = np.linalg.inv(R)
-    P = Ri @ Ri.T
-    pick = [index[k] for k in keys]
-    return P[np.ix_(pick, pick)]
+def groups_in_time(start_s: Array, end_s: Array) -> list[IntArray]:
+    """Arcs (n,) in groups of neighbours in time, each of at most GROUP: integers are sought for one group after the other."""
+    order = np.argsort(start_s + end_s, kind="stable")
+    return [np.sort(part) for part in np.array_split(order, -(-len(order) // GROUP))]
 
 
 def fix_integers(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNet, settings: AmbiguitySettings) -> FixRound:
@@ -139,7 +126,7 @@ def fix_integers(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNe
         (data, i)
         for data in links
         for i in range(len(data.block.amb_key))
-        if data.block.amb_key[i] != 0 and data.state[i] == "float"
+        if data.block.amb_key[i] != 0 and data.state[i] == "float" and data.has_integer(i)
     ]
     if not free:
         return FixRound(0, np.nan, 1.0)
@@ -148,32 +135,51 @@ def fix_integers(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNe
     free = [f for f, k in zip(free, keys, strict=True) if graph.values.exists(k)]
     if not present:
         return FixRound(0, np.nan, 1.0)
-    Q = tail_covariance(net, present)
     a = np.array([d.block.amb_value[i] for d, i in free])
+    start_s, end_s = (np.array([getattr(d, name)[i] for d, i in free]) for name in ("arc_start_s", "arc_end_s"))
     for data, _ in free:
         if len(data.float_cyc) != len(data.block.amb_key):
             data.float_cyc, data.float_sigma = data.block.amb_value.copy(), np.full(len(data.block.amb_key), np.nan)
-    for j, (data, i) in enumerate(free):
-        if np.isnan(data.float_sigma[i]):
-            data.float_sigma[i] = np.sqrt(Q[j, j])
-    result = partial.fix(a, 0.5 * (Q + Q.T), ratio_threshold=settings.ratio_threshold, min_success_rate=settings.min_success_rate)
+    is_fixed, integers, ratios, success = np.zeros(len(a), bool), a.copy(), [], 1.0
+    for group in groups_in_time(start_s, end_s):
+        Q = covariance_of(net, [present[j] for j in group])
+        for j, sigma in zip(group.tolist(), np.sqrt(np.diag(Q)).tolist(), strict=True):
+            data, i = free[j]
+            if np.isnan(data.float_sigma[i]):
+                data.float_sigma[i] = sigma
+        result = partial.fix(
+            a[group], 0.5 * (Q + Q.T), ratio_threshold=settings.ratio_threshold, min_success_rate=settings.min_success_rate
+        )
+        is_fixed[group], integers[group] = result.fixed, result.integers
+        if np.any(result.fixed):
+            ratios.append(float(result.ratio))
+            success *= float(result.success_rate)
     count = 0
+    switchable = settings.hold == "switchable"
     for j, (data, i) in enumerate(free):
-        if result.fixed[j]:
-            data.block.amb_value[i] = result.integers[j]
-            data.block.amb_key[i] = 0
+        if is_fixed[j]:
+            data.block.amb_value[i] = integers[j]
+            if not switchable:
+                data.block.amb_key[i] = 0
             data.state[i] = "fixed"
             count += 1
-    if count:
-        for data in links:
-            data.block.renew()
-    return FixRound(count, float(result.ratio), float(result.success_rate))
+    for data in links if count else []:
+        if switchable:
+            arcs = [i for (of, i), fixed in zip(free, is_fixed, strict=True) if fixed and of is data]
+            graph.blocks.append(switches.hold(data.block, np.array(arcs, np.int64), data.block.rows.source))
+        data.block.renew()
+    return FixRound(count, min(ratios, default=np.nan), success)
 
 
-def release_refused(links: list[GnssLink], settings: AmbiguitySettings) -> int:
-    """Release fixed arcs whose phase residuals refuse the integer; returns how many."""
+def release_refused(graph: Graph, links: list[GnssLink], settings: AmbiguitySettings) -> int:
+    """Release fixed arcs whose phase residuals refuse the integer, or whose switch has opened; returns how many."""
     released = 0
-    for data in links:
+    for data in links if settings.hold == "switchable" else []:
+        for switch in (b for b in graph.blocks if isinstance(b, switches.SwitchBlock) and b.of is data.block):
+            for i in switch.open_arcs().tolist():
+                data.state[i] = "released"
+                released += 1
+    for data in links if settings.hold == "constant" else []:
         block = data.block
         t = block.residuals() / block.rows.sigma
         for i in np.flatnonzero([s == "fixed" for s in data.state]):

@@ -2,28 +2,32 @@
 
 GTSAM linearises and eliminates; the loop, the robust weights, the damping and the convergence test are here, because a
 C++ optimizer copies all values into every Python factor call. One iteration: evaluate blocks, reweight, linearise,
-eliminate in COLAMD order with ambiguities and parameters last, step; a step that raises the robust cost is undone
-and the damping raised.
+eliminate along time (`ordering`), step; a step that raises the robust cost is undone and the damping raised.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 
-from factorgraph.graphs.blocks import Block, GnssBlock
+from factorgraph.graphs.blocks import KINDS, Block, GnssBlock
+from factorgraph.graphs.nodes import Nodes, take_nodes
+from factorgraph.graphs.ordering import Lives, elimination_order
 from factorgraph.graphs.parameters import Parameters
 from factorgraph.graphs.variables import ValueTable, VehicleVariables
+from factorgraph.models.robust import Loss, mixture
 from factorgraph.problem import Robust
 from factorgraph.solution import Status
 from factorgraph.types import Array, IntArray
 
 LAMBDA_START, LAMBDA_MAX = 1e-4, 1e8
 PIVOT_MIN = 1e-13  # relative to its row
-DIMENSION = {"x": 6, "b": 6, "p": 3, "v": 3, "a": 1, "i": 1, "c": 1, "s": 2, "l": 3}  # of a variable, by the letter of its key
+WIDE = 60  # columns of all states of one time, above which a minimum-degree ordering finds less fill than time does
+MANY_AMBIGUITIES = 40  # from here on the paths to their joint covariance are to be short
+DIMENSION = {"x": 6, "b": 6, "p": 3, "v": 3, "a": 1, "i": 1, "c": 1, "l": 3}  # of a variable, by the letter of its key
 
 
 @dataclass(slots=True)
@@ -47,8 +51,11 @@ class Graph:
     joints: list[Block] = field(default_factory=list)  # only for covariances: what is to share a clique
     values: gtsam.Values = field(default_factory=gtsam.Values)
     graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
-    last: list[int] = field(default_factory=list)  # keys that are eliminated last
     ambiguities: set[int] = field(default_factory=set)  # keys among the values
+
+    @property
+    def nodes(self) -> list[Nodes]:
+        return [nodes for block in self.blocks for nodes in block.nodes]
 
     def assemble(self) -> None:
         """Collect factors and values; call again after ambiguities were fixed or released or native factors renewed."""
@@ -59,8 +66,8 @@ class Graph:
         if self.values.size() == 0:
             for vehicle in self.vehicles:
                 vehicle.insert(self.values)
-            for gnss in self.gnss:
-                _put(self.values, gnss.iono_key, gnss.iono_value)
+            for nodes in self.nodes:
+                _put(self.values, nodes.key, nodes.value)
         used = {int(k) for gnss in self.gnss for k in gnss.amb_key}
         used &= set(self.graph.keyVector())
         for k in self.ambiguities - used:
@@ -69,11 +76,11 @@ class Graph:
         for gnss in self.gnss:
             mine = np.array([int(k) in used for k in gnss.amb_key], bool)
             _put(self.values, gnss.amb_key[mine], gnss.amb_value[mine])
-        self.last = sorted(used)
         for parameter in self.parameters:
-            if not self.values.exists(parameter.key):
+            if self.values.exists(parameter.key):
+                self.values.update(parameter.key, parameter.value.copy())  # biases start anew with their ambiguities
+            else:
                 self.values.insert(parameter.key, parameter.value.copy())
-            self.last.append(parameter.key)
 
     def take(self, values: gtsam.Values) -> None:
         """Make `values` current and evaluate every block there."""
@@ -85,15 +92,31 @@ class Graph:
             for i, k in enumerate(gnss.amb_key):
                 if k and values.exists(int(k)):
                     gnss.amb_value[i] = values.atVector(int(k))[0]
-            for i, k in enumerate(gnss.iono_key):
-                gnss.iono_value[i] = values.atVector(int(k))[0]
         for parameter in self.parameters:
             parameter.value = values.atVector(parameter.key)
+        take_nodes(values, self.nodes)
         for block in self.blocks:
             block.predict()
 
-    def cost(self, robust: dict[str, Robust]) -> float:
-        return self.native.error(self.values) + sum(b.cost(robust) for b in self.blocks)
+    def cost(self, losses: Mapping[str, Loss]) -> float:
+        return self.native.error(self.values) + self.block_cost(losses)
+
+    def block_cost(self, losses: Mapping[str, Loss]) -> float:
+        return sum(b.cost(losses) for b in self.blocks)
+
+    def reweight(self, robust: Mapping[str, Loss], afresh: bool = False) -> dict[str, Loss]:
+        """Robust weights of all rows at the current residuals; returns the losses, those that tune themselves as tuned."""
+        losses = {kind: self._tuned(kind, loss) for kind, loss in robust.items()}
+        for block in self.blocks:
+            block.reweight(losses, afresh)
+        return losses
+
+    def _tuned(self, kind: str, loss: Loss) -> Loss:
+        if not (isinstance(loss, Robust) and loss.kernel == "self-tuned"):
+            return loss
+        index = KINDS.index(kind)
+        parts = [b.normalised()[b.active & (b.rows.kind == index)] for b in self.blocks if np.any(b.rows.kind == index)]
+        return mixture(np.concatenate([np.zeros(0), *parts]), loss.width)
 
     def linearize(self) -> gtsam.GaussianFactorGraph:
         for block in self.blocks:
@@ -112,10 +135,20 @@ class Graph:
         return eliminate(linear, self.ordering(linear))
 
     def ordering(self, linear: gtsam.GaussianFactorGraph) -> gtsam.Ordering:
-        """COLAMD with ambiguities and parameters last."""
-        if self.last:
-            return gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, self.last)
-        return gtsam.Ordering.ColamdGaussianFactorGraph(linear)
+        """Along time, parameters last; by nested dissection where there are many ambiguities; see `graphs.ordering`."""
+        constants = [parameter.key for parameter in self.parameters]
+        if sum(sum(v.dims) for v in self.vehicles) > WIDE:
+            last = [*sorted(self.ambiguities), *constants]
+            by_degree = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph
+            return by_degree(linear, last) if last else gtsam.Ordering.ColamdGaussianFactorGraph(linear)
+        states = [[v.keys(k) for k in range(len(v.t_s))] for v in self.vehicles]
+        grid = self.vehicles[0].t_s
+        lives = [Lives.between(*gnss.sightings(), grid) for gnss in self.gnss]
+        for block in self.blocks:
+            if not isinstance(block, GnssBlock):
+                lives += [Lives.between(nodes.key[nodes.node], block.rows.t_s[nodes.row], grid) for nodes in block.nodes]
+        nested = len(self.ambiguities) > MANY_AMBIGUITIES
+        return elimination_order(states, Lives.joined(lives), constants, [int(k) for k in linear.keyVector()], nested)
 
 
 def _put(values: gtsam.Values, keys: IntArray, scalars: Array) -> None:
@@ -157,7 +190,7 @@ def _damped(linear: gtsam.GaussianFactorGraph, lam: float) -> gtsam.GaussianFact
 
 
 def optimise(
-    graph: Graph, robust: dict[str, Robust], max_iterations: int, tolerance: float, progress: Callable[[int, float], None]
+    graph: Graph, robust: Mapping[str, Loss], max_iterations: int, tolerance: float, progress: Callable[[int, float], None]
 ) -> Result:
     """Minimise the robust cost from the current values; the result's Bayes net belongs to the last linearisation.
 
@@ -166,16 +199,16 @@ def optimise(
     makes solvable ends as singular, without a Bayes net.
     """
     graph.take(graph.values)
-    for block in graph.blocks:
-        block.reweight(robust)
-    cost = graph.cost(robust)
+    losses = graph.reweight(robust, afresh=True)
+    native = graph.native.error(graph.values)
+    cost = native + graph.block_cost(losses)
     costs = [cost]
     lam = 0.0
     net, order = None, None
     singular = False
     for iteration in range(max_iterations):
-        for block in graph.blocks:
-            block.reweight(robust)
+        losses = graph.reweight(robust)
+        weighed = native + graph.block_cost(losses)  # clocks move with the weights, and losses that tune themselves change
         net = None  # the old elimination and the new system need not be in memory together
         linear = graph.linearize()
         if order is None:
@@ -187,9 +220,10 @@ def optimise(
                 singular = net is None
             if net is not None:
                 graph.take(before.retract(net.optimize()))
-                new = graph.cost(robust)
-                # robust weights lag one iteration, so near the optimum the cost may rise by next to nothing
-                if np.isfinite(new) and new <= cost + tolerance * (cost + 1):
+                native = graph.native.error(graph.values)
+                new = native + graph.block_cost(losses)
+                # linearisation errs, so near the optimum the cost may rise by next to nothing
+                if np.isfinite(new) and new <= weighed + tolerance * (weighed + 1):
                     break
                 graph.take(before)
             lam = LAMBDA_START if lam == 0 else lam * 10
@@ -197,7 +231,8 @@ def optimise(
                 status = Status.SINGULAR if net is None else Status.STALLED
                 return Result(status, costs, None if singular else eliminate(linear, order))
         lam = 0.0 if lam <= LAMBDA_START else lam / 10
-        decrease, cost = cost - new, new
+        # losses that reject outright may take turns between rows: then an iteration gets no further although its step does
+        decrease, cost = min(weighed - new, abs(cost - new)), new
         costs.append(cost)
         progress(iteration + 1, cost)
         if lam == 0.0 and decrease < tolerance * (cost + 1):

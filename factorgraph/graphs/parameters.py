@@ -1,7 +1,7 @@
 """Constants that the flight estimates beside its states: biases, scales, lever arms, mountings, time offsets.
 
 A parameter is one variable of the graph with a Gaussian prior, eliminated after all states. Its key's letter says its
-dimension: `c` 1, `s` 2, `l` 3.
+dimension: `c` 1, `l` 3.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from factorgraph.types import Array
 
-LETTERS = {1: "c", 2: "s", 3: "l"}
+LETTERS = {1: "c", 3: "l"}
 
 
 @dataclass(slots=True, eq=False)
@@ -37,7 +37,7 @@ class Parameters:
     of_name: dict[str, Parameter] = field(default_factory=dict)
 
     def add(self, name: str, components: tuple[str, ...], unit: str, prior: Array, sigma: Array) -> Parameter:
-        """The parameter of that name; made where there is none yet. prior, sigma (d,), d 1 to 3."""
+        """The parameter of that name; made where there is none yet. prior, sigma (d,), d 1 or 3."""
         if name not in self.of_name:
             prior, sigma = np.atleast_1d(np.asarray(prior, float)), np.atleast_1d(np.asarray(sigma, float))
             key = int(gtsam.symbol(LETTERS[len(prior)], len(self.of_name)))

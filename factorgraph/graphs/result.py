@@ -6,18 +6,20 @@ import dataclasses
 import platform
 from importlib.metadata import PackageNotFoundError, version
 
-import gtsam
 import numpy as np
 
 from factorgraph.attitude import quat_from_matrix
-from factorgraph.graphs.blocks import CODE, KINDS, Block, GnssBlock, IonosphereBlock, JointBlock, MotionBlock
-from factorgraph.graphs.build import HELD, Built, GnssLink
+from factorgraph.graphs.blocks import CODE, CONSTRAINT, KINDS, Block, GnssBlock
+from factorgraph.graphs.build import Built, GnssLink
 from factorgraph.graphs.covariance import JointCovariance
-from factorgraph.graphs.integers import tail_covariance
 from factorgraph.graphs.optimizer import Graph, Result
-from factorgraph.graphs.remarks import gap_remarks, unplaced_notes
+from factorgraph.graphs.pairs import PairEnd, pair_covariance, pair_ends, pair_truth
+from factorgraph.graphs.phases import slip_table
+from factorgraph.graphs.remarks import gap_remarks, heading_notes, unplaced_notes, untold_notes
 from factorgraph.graphs.variables import VehicleVariables
-from factorgraph.problem import Link, NavigationProblem
+from factorgraph.models.differencing import CommonGroups
+from factorgraph.models.outliers import classify
+from factorgraph.problem import Link, NavigationProblem, Sensor
 from factorgraph.solution import (
     ATT,
     BA,
@@ -30,11 +32,11 @@ from factorgraph.solution import (
     PairSolution,
     ParameterEstimate,
     ResidualTable,
+    SlipTable,
     Solution,
     Status,
     VehicleSolution,
 )
-from factorgraph.start import interpolate
 from factorgraph.types import Array, BoolArray, IntArray
 
 FIXED_DIFFERENCES = 4  # double differences with integers that make an epoch fixed
@@ -49,11 +51,12 @@ def make_solution(
     net = graph.covariance_net()
     cov = JointCovariance(net) if net is not None else None
     vehicles = tuple(_vehicle(v, cov) for v in graph.vehicles)
-    ends = {v.name: v for v in graph.vehicles}
     links = {(d.link.reference, d.link.rover): d for d in built.links}
-    pairs = tuple(_pair(problem, p, ends, cov, links, ratio) for p in problem.wanted_pairs)
+    pairs = tuple(_pair(problem, p, built, cov, links, ratio) for p in problem.wanted_pairs)
     residuals = _residuals(graph, problem.settings.outlier_sigma)
+    slips = slip_table(built.links)
     nis_t, nis, dof = _nis(graph, cov)
+    told = [*untold_notes(list(graph.parameters), cov), *heading_notes(vehicles)]
     gap_notes, gap_warnings = gap_remarks(problem, graph.vehicles)
     return Solution(
         name=problem.name,
@@ -62,7 +65,7 @@ def make_solution(
         frame=problem.frame,
         vehicles=vehicles,
         pairs=pairs,
-        ambiguities=_ambiguities(graph, built.links, net),
+        ambiguities=_ambiguities(graph, built.links, cov),
         residuals=residuals,
         diagnostics=Diagnostics(
             status=result.status,
@@ -73,11 +76,13 @@ def make_solution(
             nis=nis,
             nis_dof=dof,
             warnings=(*_warnings(problem, built, result.status, net is None, pairs), *gap_warnings),
-            notes=(*notes, *_slip_notes(built.links), *gap_notes, *unplaced_notes(problem)),
-            parameters=_parameters(graph, cov),
+            notes=(*notes, *_clock_notes(built), *_slip_notes(built.links, slips), *gap_notes, *unplaced_notes(problem), *told),
+            parameters=(*_parameters(graph, cov), *built.noise),
         ),
         configuration=configuration(problem),
         versions=versions(),
+        slips=slips,
+        carriers={v.name: v.carrier for v in problem.vehicles if v.carrier is not None},
     )
 
 
@@ -104,6 +109,10 @@ def configuration(problem: NavigationProblem) -> dict[str, object]:
             return [plain(v) for v in value]
         return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
 
+    def sensor(stream: Sensor) -> object:
+        lever = getattr(stream, "lever_b", None)
+        return {"calibration": plain(stream.calibration)} | ({} if lever is None else {"lever_b": plain(lever)})
+
     return {
         "settings": plain(problem.settings),
         "vehicles": {
@@ -112,15 +121,21 @@ def configuration(problem: NavigationProblem) -> dict[str, object]:
                 "imu_noise": plain(v.imu_noise) if v.imu is not None else None,
                 "gnss_noise": plain(v.gnss.noise) if v.gnss is not None else None,
                 "gnss_lever_b": plain(v.gnss.lever_b) if v.gnss is not None else None,
+                "gnss_calibration": plain(v.gnss.calibration) if v.gnss is not None else None,
+                "imu_calibration": plain(v.imu_calibration) if v.imu is not None else None,
+                "constraints": plain(v.constraints),
+                "carrier": v.carrier,
                 "motion": plain(v.motion) if v.imu is None else None,
+                "sensors": {s.name: sensor(s) for s in v.sensors},
             }
             for v in problem.vehicles
         },
         "links": [plain(link) for link in problem.links],
         "ranges": [
-            {"name": m.stream.name, "bias_sigma_m": m.bias_sigma_m, "scale_sigma": m.scale_sigma, "per_pair": m.per_pair}
+            {"name": m.stream.name} | {f.name: getattr(m, f.name) for f in dataclasses.fields(m) if f.name != "stream"}
             for m in problem.ranges
         ],
+        "visions": {s.name: {"calibration": plain(s.calibration)} for s in problem.visions},
     }
 
 
@@ -156,63 +171,38 @@ def _vehicle(v: VehicleVariables, cov: JointCovariance | None) -> VehicleSolutio
 def _pair(
     problem: NavigationProblem,
     pair: Link,
-    ends: dict[str, VehicleVariables],
+    built: Built,
     cov: JointCovariance | None,
     links: dict[tuple[str, str], GnssLink],
     ratio: float,
 ) -> PairSolution:
-    a, b = ends[pair.reference], ends[pair.rover]
-    K = len(a.t_s)
-    C = problem.frame.C_to_enu(a.r)  # n -> east-north-up at the reference
-    P = pair_covariance(problem, a, b, cov) if cov is not None else np.full((K, 6, 6), np.nan)
-    fix, n_sat, ratios = _pair_fix(pair, links, ends, K, ratio)
-    truth, truth_v = _pair_truth(a, b, C)
+    a, b = both = pair_ends(problem, built.graph.vehicles, pair)
+    (r_a, v_a), (r_b, v_b) = a.motion(), b.motion()
+    t_s = a.vehicle.t_s
+    K = len(t_s)
+    C = problem.frame.C_to_enu(r_a)  # n -> east-north-up at the reference
+    P = pair_covariance(problem, both, cov) if cov is not None else np.full((K, 6, 6), np.nan)
+    fix, n_sat, ratios = _pair_fix(pair, links, built.ends, K, ratio)
+    truth, truth_v = pair_truth(both, C)
     return PairSolution(
         pair.reference,
         pair.rover,
-        a.t_s,
-        np.einsum("kij,kj->ki", C, b.r - a.r),
-        np.einsum("kij,kj->ki", C, b.v - a.v),
+        t_s,
+        np.einsum("kij,kj->ki", C, r_b - r_a),
+        np.einsum("kij,kj->ki", C, v_b - v_a),
         P,
         fix,
         ratios,
         n_sat,
         truth,
         truth_v,
+        *(_lever(end) for end in both),
     )
 
 
-def pair_covariance(problem: NavigationProblem, a: VehicleVariables, b: VehicleVariables, cov: JointCovariance) -> Array:
-    """Covariance (K, 6, 6) of b relative to a, position and velocity, east-north-up at a."""
-    C = problem.frame.C_to_enu(a.r)  # n -> east-north-up at the reference
-    CC = np.zeros((len(C), 6, 6))
-    CC[:, :3, :3], CC[:, 3:, 3:] = C, C
-    keys = [[key for v in (a, b) for key in v.keys(k)[:2]] for k in range(len(C))]
-    T = []
-    for v, sign in ((a, -1.0), (b, 1.0)):
-        if v.mode != "fixed":
-            width = 9 if v.mode == "imu" else 6
-            T.append(np.array([sign * _state_map(v, k)[:6, :width] for k in range(len(C))]))
-    CT = CC @ np.concatenate(T, axis=2)
-    return np.asarray(CT @ cov.joints(keys) @ np.swapaxes(CT, 1, 2))
-
-
-def _pair_truth(a: VehicleVariables, b: VehicleVariables, C: Array) -> tuple[Array | None, Array | None]:
-    r, v = [], []
-    for end in (a, b):
-        truth = end.vehicle.truth
-        if end.mode == "fixed":
-            r.append(end.r)
-            v.append(end.v)
-        elif truth is None:
-            return None, None
-        else:
-            outside = (end.t_s < truth.t_s[0] - 1e-6) | (end.t_s > truth.t_s[-1] + 1e-6)
-            r.append(np.where(outside[:, None], np.nan, interpolate(end.t_s, truth.t_s, truth.r_n)))
-            if truth.v_n is not None:
-                v.append(np.where(outside[:, None], np.nan, interpolate(end.t_s, truth.t_s, truth.v_n)))
-    dv = np.einsum("kij,kj->ki", C, v[1] - v[0]) if len(v) == 2 else None
-    return np.einsum("kij,kj->ki", C, r[1] - r[0]), dv
+def _lever(end: PairEnd) -> tuple[float, float, float]:
+    x, y, z = end.lever_b.tolist() if end.has_lever else (0.0, 0.0, 0.0)
+    return x, y, z
 
 
 def _pair_fix(
@@ -246,8 +236,10 @@ def _fix_status(link: GnssLink | None, rover: VehicleVariables, K: int, ratio: f
     held = np.zeros(block.n, bool)
     state = np.array(link.state or [""])
     held[phase] = np.isin(state[block.arc[phase]], ["fixed", "datum"])
-    in_group = clocks.sum(held.astype(float))
-    k_group = k_row[clocks.start]
+    # each constellation has its own datum, also where it shares the clock
+    cells = CommonGroups.from_labels(clocks.of_row * len(block.rows.group) + block.rows.group_index)
+    in_group = cells.sum(held.astype(float))
+    k_group = k_row[cells.start]
     differences = np.bincount(k_group, np.maximum(in_group - 1, 0), minlength=K)
     any_phase = np.bincount(k_row[phase], minlength=K) > 0
     fix[any_phase] = Fix.FLOAT.value
@@ -265,7 +257,7 @@ def _fix_status(link: GnssLink | None, rover: VehicleVariables, K: int, ratio: f
     return fix, n_sat, ratios
 
 
-def _ambiguities(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNet | None) -> AmbiguityTable:
+def _ambiguities(graph: Graph, links: list[GnssLink], cov: JointCovariance | None) -> AmbiguityTable:
     links = [data for data in links if len(data.state)]
     if not links:
         return AmbiguityTable()
@@ -276,12 +268,13 @@ def _ambiguities(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNe
         held = np.isin(state, ["fixed", "datum"])
         sigma = np.where(state == "fixed", data.float_sigma, np.nan) if len(data.float_sigma) else np.full(len(keys), np.nan)
         free = np.array([k != 0 and graph.values.exists(int(k)) for k in keys])
-        if np.any(free) and net is not None:
-            sigma[free] = np.sqrt(np.diag(tail_covariance(net, [int(k) for k in keys[free]])))
+        if np.any(free) and cov is not None:
+            sigma[free] = np.sqrt(cov.joints(keys[free][:, None])[:, 0, 0])
         names += [f"{data.link.reference}-{data.link.rover}"] * len(keys)
-        values.append(data.float_cyc if len(data.float_cyc) else data.block.amb_value)
-        sigmas.append(sigma)
-        integers.append(np.where(held, data.block.amb_value, np.nan))
+        unit = data.block.amb_unit_cyc
+        values.append(unit * (data.float_cyc if len(data.float_cyc) else data.block.amb_value))
+        sigmas.append(unit * sigma)
+        integers.append(np.where(held, unit * np.round(data.block.amb_value), np.nan))
     return AmbiguityTable(
         link=tuple(names),
         satellite=tuple(s for data in links for s in data.arc_satellite),
@@ -296,7 +289,7 @@ def _ambiguities(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNe
 
 
 def _measured(graph: Graph) -> list[Block]:
-    return [b for b in graph.blocks if not isinstance(b, (MotionBlock, JointBlock, IonosphereBlock))]
+    return [b for b in graph.blocks if np.any(b.rows.kind >= 0)]
 
 
 def _residuals(graph: Graph, outlier_sigma: float) -> ResidualTable:
@@ -320,15 +313,22 @@ def _residuals(graph: Graph, outlier_sigma: float) -> ResidualTable:
             label,
             rows.t_s,
             b.residuals(),
-            rows.sigma,
+            rows.single_sigma,
             b.w,
             outlier,
             rows.azimuth_rad,
             rows.elevation_rad,
+            rows.cn0_dbhz if rows.cn0_dbhz is not None else np.full(b.n, np.nan),
+            np.full(b.n, isinstance(b, GnssBlock) and b.reference is not None),
         )
         parts.append(tuple(np.asarray(c)[active] for c in columns))
-    joined = [np.concatenate([p[i] for p in parts]) for i in range(len(parts[0]))]
-    return ResidualTable(KINDS, tuple(sources), tuple(labels), *joined)
+    kind, source, label, t_s, residual, sigma, weight, outlier, azimuth, elevation, cn0, differenced = (
+        np.concatenate([p[i] for p in parts]) for i in range(len(parts[0]))
+    )
+    series = source * max(len(labels), 1) + label
+    classes = classify(KINDS, kind, series, t_s, residual, outlier, elevation, cn0, differenced)
+    numbers = (kind, source, label, t_s, residual, sigma, weight, outlier, azimuth, elevation, cn0, classes)
+    return ResidualTable(KINDS, tuple(sources), tuple(labels), *numbers)
 
 
 def _index(names: list[str], name: str) -> int:
@@ -342,9 +342,9 @@ def _nis(graph: Graph, cov: JointCovariance | None) -> tuple[Array, Array, Array
 
     E[e^T e] = rows - clocks - trace(J P J^T) for a factor with whitened Jacobian J and posterior covariance P of its
     variables; rows that robust weights push down do not count. Undifferenced code is left out: its standard deviation
-    stands for errors that persist, so its residuals are small by intention.
+    stands for errors that persist, so its residuals are small by intention. So are constraints, which nothing measures.
     """
-    blocks = _measured(graph)
+    blocks = [b for b in _measured(graph) if not np.any(b.rows.kind == CONSTRAINT)]
     if not blocks or cov is None:
         return np.zeros(0), np.zeros(0), np.zeros(0)
     t = graph.vehicles[0].t_s
@@ -359,7 +359,8 @@ def _nis(graph: Graph, cov: JointCovariance | None) -> tuple[Array, Array, Array
         expected = b.rows.factor.sum((counts & (b.w > 0.5)).astype(float))
         if b.rows.clocks is not None:
             first = b.rows.clocks.start
-            np.subtract.at(expected, b.rows.factor.of_row[first], counts[first].astype(float))
+            observed = counts[first] & (b.rows.clocks.sum(b.active.astype(float)) > 0)
+            np.subtract.at(expected, b.rows.factor.of_row[first], observed.astype(float))
         k = np.clip(np.searchsorted(t, b.rows.t_s[starts] + 5e-3, side="right") - 1, 0, len(t) - 1)
         keys = [b.keys(f) for f in range(len(starts))]
         alike = len({len(each) for each in keys}) == 1
@@ -374,15 +375,13 @@ def _nis(graph: Graph, cov: JointCovariance | None) -> tuple[Array, Array, Array
 
 
 def _parameters(graph: Graph, cov: JointCovariance | None) -> tuple[ParameterEstimate, ...]:
-    """Every estimated constant with its prior; components that their prior holds are left out."""
+    """Every estimated constant with its prior."""
     out = []
     for p in graph.parameters:
         sigma = np.sqrt(np.diag(cov.joint([p.key]))) if cov is not None else np.full(len(p.value), np.nan)
         for i, component in enumerate(p.components):
-            if p.sigma[i] > HELD:
-                name, unit = f"{p.name} {component}".strip(), "1" if component == "scale" else p.unit
-                values = (p.value[i], sigma[i], p.prior[i], p.sigma[i])
-                out.append(ParameterEstimate(name, unit, *(float(x) for x in values)))
+            values = (p.value[i], sigma[i], p.prior[i], p.sigma[i])
+            out.append(ParameterEstimate(f"{p.name} {component}".strip(), p.unit, *(float(x) for x in values)))
     return tuple(out)
 
 
@@ -407,13 +406,22 @@ def _warnings(
     return out
 
 
-def _slip_notes(links: list[GnssLink]) -> list[str]:
+def _clock_notes(built: Built) -> list[str]:
+    return [f"{name}: {rx.jumps}" for name, rx in built.receivers.items() if len(rx.jumps.t_s)]
+
+
+def _slip_notes(links: list[GnssLink], slips: SlipTable) -> list[str]:
     notes = []
     for data in links:
-        found = ", ".join(f"{n} by {reason}" for reason, n in data.slips.items() if n)
         released = sum(s == "released" for s in data.state)
         text = f"{data.link.reference}-{data.link.rover}: {len(data.state)} phase arcs"
+        mine = slips.of_link(f"{data.link.reference}-{data.link.rover}")
+        causes = [c for c, mended in zip(mine.cause, mine.repaired, strict=True) if not mended]
+        found = ", ".join(f"{causes.count(cause)} by {cause}" for cause in sorted(set(causes)))
         text += f"; arcs ended: {found}" if found else ""
+        mended = int(np.sum(mine.repaired & (mine.cycles != 0)))
+        text += f"; {mended} slips repaired" if mended else ""
+        text += f"; {int(np.sum(mine.repaired)) - mended} ends of arcs without a slip joined" if np.any(mine.cycles == 0) else ""
         text += f"; {released} integers released" if released else ""
         notes.append(text)
     return notes

@@ -13,9 +13,7 @@ from factorgraph.problem import Vec3
 from factorgraph.types import Array, BoolArray, IntArray
 
 
-def plain_rows(
-    kind: int, t: Array, sigma: Array, factor: IntArray, source: str, label: list[str], label_index: IntArray
-) -> Rows:
+def plain_rows(kind: int, t: Array, sigma: Array, factor: IntArray, source: str, label: list[str], label_index: IntArray) -> Rows:
     """Rows of one kind without common clocks; `factor` (n,) labels the factor of each, in order."""
     nothing = np.full(len(t), np.nan)
     zeros = np.zeros(len(t), np.int64)

@@ -22,6 +22,7 @@ import numpy as np
 
 from factorgraph.attitude import exp_so3, right_jacobian, skew
 from factorgraph.geodesy import LocalFrame, centrifugal_ecef
+from factorgraph.graphs._point_kernels import carried_points
 from factorgraph.graphs.parameters import Parameter
 from factorgraph.grid import MERGE_S
 from factorgraph.measurements import ImuStream
@@ -101,12 +102,17 @@ class VehicleVariables:
         self.r = np.tile(np.asarray(vehicle.fixed_n, float), (K, 1)) if vehicle.fixed_n is not None else np.zeros((K, 3))
         self.v = np.zeros((K, 3))
         self.R = np.tile(np.eye(3), (K, 1, 1))
+        # of the first state: mean C_nb, standard deviations about east, north, up
+        self.attitude_prior = (np.eye(3), np.array([1.0, 1.0, 3.0]))
         self.bias = np.zeros((K, 6))  # gyroscope, accelerometer
         self.preintegrated_bias = np.zeros((K, 6))
         letters = {"imu": "xvb", "motion": "pv", "fixed": ""}[self.mode]
         self._keys = [tuple(key(letter, index, k) for letter in letters) for k in range(K)]
         self.imu_offset: Parameter | None = None  # of the IMU's time tags, where it is estimated
         self.imu_applied_s = 0.0  # what of it the stream in use is free of
+        self.gyro_scale: Parameter | None = None  # of the IMU, each axis, where they are estimated
+        self.accel_scale: Parameter | None = None
+        self.applied_scale = np.zeros(6)  # gyroscope, accelerometer: what of them the stream in use is free of
         self._imu = self.vehicle.imu
         self.gaps_s = preintegration.gaps(self.imu) if self.mode == "imu" else np.zeros((0, 2))
 
@@ -115,12 +121,21 @@ class VehicleVariables:
         assert self._imu is not None
         return self._imu
 
-    def apply_imu_offset(self) -> None:
-        """Take the current estimate of the IMU's time offset out of its stream."""
-        if self.imu_offset is not None and self.vehicle.imu is not None:
-            self.imu_applied_s = float(self.imu_offset.value[0])
-            self._imu = replace(self.vehicle.imu, t_s=self.vehicle.imu.t_s - self.imu_applied_s)
-            self.gaps_s = preintegration.gaps(self.imu)
+    @property
+    def imu_scale(self) -> Array:
+        """Current scale factors (6,) of gyroscope and accelerometer; a sensor shows 1 + scale times truth plus bias."""
+        return np.concatenate([np.zeros(3) if p is None else p.value for p in (self.gyro_scale, self.accel_scale)])
+
+    def apply_imu_calibration(self) -> None:
+        """Take the current estimates of the IMU's time offset and scale factors out of its stream."""
+        imu = self.vehicle.imu
+        if imu is None or (self.imu_offset is None and self.gyro_scale is None and self.accel_scale is None):
+            return
+        self.imu_applied_s = 0.0 if self.imu_offset is None else float(self.imu_offset.value[0])
+        self.applied_scale = self.imu_scale
+        gyro, accel = 1 + self.applied_scale[:3], 1 + self.applied_scale[3:]
+        self._imu = replace(imu, t_s=imu.t_s - self.imu_applied_s, w_b=imu.w_b / gyro, f_b=imu.f_b / accel)
+        self.gaps_s = preintegration.gaps(self.imu)
 
     def keys(self, k: int) -> tuple[int, ...]:
         """Keys of state k in the order of the local columns."""
@@ -130,8 +145,11 @@ class VehicleVariables:
     def dims(self) -> tuple[int, ...]:
         return {"imu": (6, 3, 6), "motion": (3, 3), "fixed": ()}[self.mode]
 
-    def query(self, t_s: Array, lever_b: Array | tuple[float, float, float]) -> Query:
-        """Attach times (n,) to states; points within NEAR_S of a state, or of a vehicle without IMU, use its velocity."""
+    def query(self, t_s: Array, lever_b: Array | tuple[float, float, float], states: IntArray | None = None) -> Query:
+        """Attach times (n,) to states; points within NEAR_S of a state, or of a vehicle without IMU, use its velocity.
+
+        states (n,): other states than the latest before each time.
+        """
         t_s = np.asarray(t_s, float)
         lever = np.broadcast_to(np.asarray(lever_b, float), (len(t_s), 3))
         if self.mode != "imu":  # nearest state: dt is small, or the vehicle does not move
@@ -140,7 +158,7 @@ class VehicleVariables:
                 np.where(t_s - self.t_s[k - 1] <= self.t_s[np.minimum(k, len(self.t_s) - 1)] - t_s, k - 1, k), len(self.t_s) - 1
             )
             return Query(k, t_s - self.t_s[k], lever, None)
-        k = self._before(t_s)
+        k = self._before(t_s) if states is None else states
         dt = t_s - self.t_s[k]
         if np.all(dt <= NEAR_S):
             return Query(k, dt, lever, None)
@@ -195,8 +213,8 @@ class VehicleVariables:
             return Point(self.r[q.k] + self.v[q.k] * dt, self.v[q.k], J_r, J_v, self.R[q.k])
         R, v = self.R[q.k], self.v[q.k]
         rate = self.body_rate(self.t_s[q.k] + q.dt_s, q.k)
-        w_l = np.cross(rate, q.lever_b)
         if q.increments is None:
+            w_l = np.cross(rate, q.lever_b)
             J_r, J_v = np.zeros((n, 3, 9)), np.zeros((n, 3, 9))
             r = self.r[q.k] + v * dt + np.einsum("nij,nj->ni", R, q.lever_b + w_l * dt)
             J_r[:, :, :3], J_r[:, :, 3:6], J_r[:, :, 6:] = -R @ skew(q.lever_b), R, eye * dt[..., None]
@@ -205,27 +223,30 @@ class VehicleVariables:
             return Point(r, v + np.einsum("nij,nj->ni", R, w_l), J_r, J_v, R)
         inc = q.increments
         db = self.bias[q.k] - self.preintegrated_bias[q.k]
-        # up to NEAR_S before its state no increments carry a point, so gravity alone must not: constant velocity and rate
-        ahead, behind = np.maximum(dt, 0.0), np.minimum(dt, 0.0)
-        dR = inc.dR @ exp_so3(np.einsum("nij,nj->ni", inc.dR_dbg, db[:, :3]) + rate * behind)
-        dp = inc.dp + np.einsum("nij,nj->ni", inc.dp_dbg, db[:, :3]) + np.einsum("nij,nj->ni", inc.dp_dba, db[:, 3:])
-        g = self.gravity_terms(q.k)
-        turn = exp_so3(-self.frame.w_ie_n * ahead)
-        Rt = turn @ R @ dR
-        r = self.r[q.k] + v * dt + 0.5 * g * ahead**2 + np.einsum("nij,nj->ni", R, dp) + np.einsum("nij,nj->ni", Rt, q.lever_b)
-        lever_k = np.einsum("nij,nj->ni", dR, q.lever_b)
-        J_r, J_v = np.zeros((n, 3, 15)), np.zeros((n, 3, 15))
-        J_r[:, :, :3], J_r[:, :, 3:6], J_r[:, :, 6:9] = -R @ skew(dp + lever_k), R, eye * dt[..., None]
-        J_r[:, :, 9:12] = R @ inc.dp_dba
-        J_r[:, :, 12:15] = R @ inc.dp_dbg - Rt @ skew(q.lever_b) @ inc.dR_dbg
-        if not velocity:
-            return Point(r, np.zeros((n, 3)), J_r, J_v, Rt)
-        dv = inc.dv + np.einsum("nij,nj->ni", inc.dv_dbg, db[:, :3]) + np.einsum("nij,nj->ni", inc.dv_dba, db[:, 3:])
-        vel = v + g * ahead + np.einsum("nij,nj->ni", R, dv) + np.einsum("nij,nj->ni", Rt, w_l)
-        J_v[:, :, :3], J_v[:, :, 6:9] = -R @ skew(dv + np.einsum("nij,nj->ni", dR, w_l)), eye
-        J_v[:, :, 9:12] = R @ inc.dv_dba
-        J_v[:, :, 12:15] = R @ inc.dv_dbg - Rt @ skew(w_l) @ inc.dR_dbg + Rt @ skew(q.lever_b)
-        return Point(r, vel, J_r, J_v, Rt)
+        out = (np.empty((n, 3)), np.zeros((n, 3)), np.zeros((n, 3, 15)), np.zeros((n, 3, 15)), np.empty((n, 3, 3)))
+        carried_points(
+            q.k,
+            q.dt_s,
+            np.ascontiguousarray(q.lever_b),
+            np.ascontiguousarray(self.R),
+            self.r,
+            self.v,
+            self.gravity_terms(q.k),
+            rate,
+            db,
+            self.frame.w_ie_n,
+            inc.dR,
+            inc.dv,
+            inc.dp,
+            inc.dR_dbg,
+            inc.dv_dbg,
+            inc.dv_dba,
+            inc.dp_dbg,
+            inc.dp_dba,
+            velocity,
+            out,
+        )
+        return Point(*out)
 
     def frames(self, q: Query) -> tuple[Array, Array]:
         """Attitude C_nb (n, 3, 3) at a query's times, and its Jacobian (n, 3, w): R_t Exp(J dx) for local columns dx.

@@ -1,8 +1,9 @@
 """Carrier-phase arcs: where a satellite's ambiguity stays one integer, and where it slipped.
 
 An arc of a receiver pair's single differences ends at a loss-of-lock flag of either receiver, at a gap, where phase and
-Doppler disagree, or where the geometry-free combination of two bands jumps. What these miss, the residuals of the
-solution show (`split_at_steps`).
+Doppler disagree, where the geometry-free combination of two bands jumps, or where a receiver begins or ceases to flag its
+phase as ambiguous by half a cycle. What these miss shows against a predicted trajectory (`factorgraph.models.slips`) and
+in the residuals of the solution (`split_at_steps`).
 """
 
 from __future__ import annotations
@@ -12,11 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph.measurements import GnssStream
+from factorgraph.models.clock_jumps import MS_M
+from factorgraph.models.differencing import CommonGroups
 from factorgraph.models.gnss import PairedRows
 from factorgraph.problem import AmbiguitySettings
 from factorgraph.types import Array, BoolArray, IntArray
 
 GAP_INTERVALS = 2.5
+CAUSES = ("gap", "loss of lock", "phase against Doppler", "geometry-free", "half-cycle flag", "prediction", "residual step")
+PREDICTION, RESIDUAL_STEP = 5, 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +31,8 @@ class Arcs:
     of_row: IntArray  # (n,)
     count: int
     slips: dict[str, int]  # reason -> number
+    cause: IntArray  # (n,) of a row that begins an arc after another: index into CAUSES; -1 elsewhere
+    half: BoolArray  # (n,) flagged as ambiguous by half a cycle
 
 
 def _lock_losses(stream: GnssStream) -> IntArray:
@@ -39,28 +46,35 @@ def _lock_losses(stream: GnssStream) -> IntArray:
 
 
 def _doppler_slips(stream: GnssStream, rows: IntArray, previous: IntArray, threshold_cyc: float) -> BoolArray:
-    """Phase change against the mean Doppler, the receiver's common clock part removed by the median of each epoch."""
+    """Phase change against the mean Doppler, the receiver's common clock part removed by the median of each epoch.
+
+    Where the clock jumped by milliseconds, the receiver observed so much earlier or later than its time tags say.
+    """
     dt = stream.t_s[stream.epoch[rows]] - stream.t_s[stream.epoch[previous]]
-    change = stream.phase_cyc[rows] - stream.phase_cyc[previous]
-    miss = (change + 0.5 * (stream.doppler_hz[rows] + stream.doppler_hz[previous]) * dt) * stream.wavelength_m[rows]
+    lam = stream.wavelength_m[rows]
+    speed = 0.5 * lam * (stream.doppler_hz[rows] + stream.doppler_hz[previous])
+    miss = lam * (stream.phase_cyc[rows] - stream.phase_cyc[previous]) + speed * dt
     slip = np.zeros(len(rows), bool)
     ok = np.flatnonzero(np.isfinite(miss))
-    order = ok[np.argsort(stream.epoch[rows[ok]], kind="stable")]
-    epochs, first = np.unique(stream.epoch[rows[order]], return_index=True)
-    for part in np.split(order, first[1:]) if len(epochs) else []:
-        slip[part] = np.abs(miss[part] - np.median(miss[part])) > threshold_cyc * stream.wavelength_m[rows[part]]
+    ok = ok[np.argsort(stream.epoch[rows[ok]], kind="stable")]
+    groups = CommonGroups.from_labels(stream.epoch[rows[ok]])
+    every = np.ones(len(ok), bool)
+    jump_s = 1e-3 * np.rint(groups.median(miss[ok], every) / MS_M)
+    miss[ok] -= speed[ok] * jump_s[groups.of_row]
+    slip[ok] = np.abs(miss[ok] - groups.median(miss[ok], every)[groups.of_row]) > threshold_cyc * lam[ok]
     return slip
 
 
 def find_arcs(a: GnssStream, b: GnssStream, pairs: PairedRows, usable: BoolArray, settings: AmbiguitySettings) -> Arcs:
     """Arcs of the pair's phases; `usable` (n,) says which paired rows have a phase on both sides worth using."""
     n = len(pairs.a)
-    of_row = np.full(n, -1, np.int64)
+    of_row, cause = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
+    half_a, half_b = (a.lli[pairs.a] & 2) > 0, (b.lli[pairs.b] & 2) > 0
     rows = np.flatnonzero(usable)
     sat = b.sat[pairs.b]
     order = rows[np.lexsort((pairs.epoch[rows], pairs.group[rows], sat[rows]))]
     if not len(order):
-        return Arcs(of_row, 0, {})
+        return Arcs(of_row, 0, {}, cause, half_a | half_b)
     series = sat[order] * len(pairs.group_names) + pairs.group[order]
     same = np.concatenate([[False], series[1:] == series[:-1]])
     here, before = order[1:], order[:-1]
@@ -78,16 +92,18 @@ def find_arcs(a: GnssStream, b: GnssStream, pairs: PairedRows, usable: BoolArray
         doppler |= found & same[1:]
     reasons["phase against Doppler"] = doppler & ~reasons["gap"]
     reasons["geometry-free"] = _geometry_free_slips(a, b, pairs, sat, order, same, settings.slip_geometry_free_m)
+    reasons["half-cycle flag"] = (half_a[here] != half_a[before]) | (half_b[here] != half_b[before])
     cut = np.zeros(len(here), bool)
     slips = {}
     for name, flags in reasons.items():
         new = flags & same[1:] & ~cut
         slips[name] = int(new.sum())
+        cause[here[new]] = CAUSES.index(name)
         cut |= flags
     starts = np.concatenate([[True], cut | ~same[1:]])
     arc = np.cumsum(starts) - 1
     of_row[order] = arc
-    return Arcs(of_row, int(arc[-1]) + 1, slips)
+    return Arcs(of_row, int(arc[-1]) + 1, slips, cause, half_a | half_b)
 
 
 def _geometry_free_slips(

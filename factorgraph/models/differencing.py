@@ -16,8 +16,31 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
-from factorgraph.types import Array, IntArray
+from factorgraph.types import Array, BoolArray, IntArray
+
+
+@njit(cache=True)
+def _project(start, rows, u, out):  # type: ignore[no-untyped-def]
+    """out = P diag(u) rows for every group of consecutive rows."""
+    n, w = rows.shape
+    common = np.empty(w)
+    for g in range(len(start)):
+        a, b = start[g], start[g + 1] if g + 1 < len(start) else n
+        total = 0.0
+        common[:] = 0.0
+        for i in range(a, b):
+            weight = u[i] * u[i]
+            total += weight
+            for c in range(w):
+                common[c] += weight * rows[i, c]
+        if total > 0:
+            for c in range(w):
+                common[c] /= total
+        for i in range(a, b):
+            for c in range(w):
+                out[i, c] = u[i] * (rows[i, c] - common[c])
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,13 +71,21 @@ class CommonGroups:
         S = self.sum(u * u)
         return self.sum(u * u * values) / np.where(S > 0, S, 1.0)
 
+    def median(self, values: Array, active: BoolArray) -> Array:
+        """Medians of the active values of each group (g,); 0 for a group without any."""
+        if len(self.start) == 0:
+            return np.zeros(0)
+        ordered = values[np.lexsort((values, ~active, self.of_row))]
+        count = self.sum(active.astype(np.int64))
+        low, high = self.start + np.maximum(count - 1, 0) // 2, self.start + np.minimum(count // 2, np.maximum(count - 1, 0))
+        return np.where(count > 0, 0.5 * (ordered[low] + ordered[high]), 0.0)
+
     def project(self, rows: Array, u: Array) -> Array:
         """Whiten rows (n,) or (n, w) by u (n,) and take out what is common to each group."""
-        column = u if rows.ndim == 1 else u[:, None]
-        S = self.sum(u * u)
-        S = np.where(S > 0, S, 1.0)
-        common = self.sum(column * column * rows) / (S if rows.ndim == 1 else S[:, None])
-        return column * (rows - common[self.of_row])
+        out = np.empty(rows.shape)
+        shape = (len(u), 1 if rows.ndim == 1 else rows.shape[1])
+        _project(self.start, np.ascontiguousarray(rows).reshape(shape), u, out.reshape(shape))
+        return out
 
     def leverage(self, u: Array) -> Array:
         """Share (n,) of each row in its own group's common value: var(residual) = sigma^2 (1 - leverage)."""

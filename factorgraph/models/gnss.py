@@ -77,9 +77,17 @@ def without_ionosphere(p: Prepared) -> Prepared:
 
 
 def prepare(
-    stream: GnssStream, frame: LocalFrame, r_n: Array, clock_s: Array, klobuchar: Array | None, tow0_s: float
+    stream: GnssStream,
+    frame: LocalFrame,
+    r_n: Array,
+    clock_s: Array,
+    klobuchar: Array | None,
+    tow0_s: float,
+    day_of_year: float | None = None,
 ) -> Prepared:
     """Correct a receiver's rows given approximate antenna positions r_n (m, 3) and clock offsets (m,) per epoch.
+
+    With the day of the year the troposphere is mapped by Niell's functions, else by 1 / sin(el).
 
     Positions good to 10 m leave 1e-4 m in the geometry of single ranges and nothing in differences; heights good to 1 m
     leave 0.3 mm / sin(el) of troposphere, in differences too.
@@ -92,7 +100,7 @@ def prepare(
     los /= np.linalg.norm(los, axis=1, keepdims=True)
     enu = np.einsum("nij,nj->ni", geodesy.C_en(lat, lon), los)
     az, el = look_angles(enu)
-    tropo = atmosphere.troposphere_m(lat, h, el)
+    tropo = atmosphere.troposphere_m(lat, h, el, day_of_year=day_of_year)
     iono = np.zeros_like(tropo)
     if klobuchar is not None:
         l1 = atmosphere.klobuchar_m(klobuchar, tow0_s + stream.t_s[stream.epoch], lat, lon, az, el)
@@ -127,6 +135,33 @@ def one_code_per_satellite(stream: GnssStream, usable: BoolArray) -> IntArray:
     key = stream.epoch[rows] * len(stream.satellites) + stream.sat[rows]
     first = np.concatenate([[True], key[1:] != key[:-1]]) if rows.size else np.zeros(0, bool)
     return np.sort(rows[first])
+
+
+def two_codes_per_satellite(stream: GnssStream, usable: BoolArray) -> tuple[IntArray, IntArray]:
+    """Rows of two bands' codes of one satellite and epoch: of every constellation the two signals seen together most often.
+
+    The pair is one and the same all along, so that its delays in the receiver stay with the clock.
+    """
+    rows = np.flatnonzero(usable & np.isfinite(stream.code_m) & np.isfinite(stream.sat_clock_m))
+    letters = system_of(stream)[rows]
+    firsts, seconds = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for letter in np.unique(letters):
+        mine = rows[letters == letter]
+        key = stream.epoch[mine] * len(stream.satellites) + stream.sat[mine]
+        signals = [k for k in np.unique(stream.signal[mine]).tolist()]
+        best = (np.zeros(0, np.int64), np.zeros(0, np.int64))
+        for a in signals:
+            for b in signals:
+                if stream.signals[a][1] < stream.signals[b][1]:
+                    of_a, of_b = stream.signal[mine] == a, stream.signal[mine] == b
+                    _, i, j = np.intersect1d(key[of_a], key[of_b], assume_unique=True, return_indices=True)
+                    if len(i) > len(best[0]):
+                        best = (mine[of_a][i], mine[of_b][j])
+        firsts.append(best[0])
+        seconds.append(best[1])
+    first, second = np.concatenate(firsts), np.concatenate(seconds)
+    order = np.argsort(first)
+    return first[order], second[order]
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,16 +5,16 @@ Over a short step with constant body rate w and specific force f the increments 
     dR = Exp(w dt),  dv = (I dt + [w x] dt^2 / 2 + [w x]^2 dt^3 / 6) f,  dp = (I dt^2 / 2 + [w x] dt^3 / 6 + [w x]^2 dt^4 / 24) f
 
 and chain as R <- R dR, p <- p + v dt + R dp, v <- v + R dv. Jacobians to the biases follow the same recursion
-(right Jacobian for the rotation). From increments at a few times per interval, `gtsam_inputs` derives rates and forces
-that make GTSAM's tangent-space Euler steps reproduce rotation, velocity and position exactly at the end of every pair of
-steps, so its native factor gets 200 Hz accuracy from 20 calls a second.
+(right Jacobian for the rotation). From increments at a few times per interval, `grouped_inputs` derives rates and forces
+that make Euler steps in the tangent space (`imu_interval`, and GTSAM's) reproduce rotation, velocity and position exactly at
+the end of every pair of steps, so covariances and Jacobians of 200 Hz samples need 20 steps a second.
 
 Source: Forster et al. (2017), sec. VI; Groves (2013), ch. 5, for the constant-rate increments.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -43,7 +43,7 @@ class Increments:
     w_b: Array  # (n, 3) angular rate at the end, bias not removed
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _mul(A, B, C):  # type: ignore[no-untyped-def]
     """C = A B for 3 x 3, C distinct from both."""
     for i in range(3):
@@ -51,7 +51,7 @@ def _mul(A, B, C):  # type: ignore[no-untyped-def]
             C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _polynomial(v, a, b, c, C):  # type: ignore[no-untyped-def]
     """C = a I + b [v x] + c [v x]^2."""
     x, y, z = v[0], v[1], v[2]
@@ -60,7 +60,7 @@ def _polynomial(v, a, b, c, C):  # type: ignore[no-untyped-def]
     C[2, 0], C[2, 1], C[2, 2] = c * x * z - b * y, c * y * z + b * x, a - c * (x * x + y * y)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _rotation_coefficients(a2):  # type: ignore[no-untyped-def]
     """sin a / a, (1 - cos a) / a^2, (a - sin a) / a^3."""
     if a2 < 1e-8:
@@ -70,11 +70,20 @@ def _rotation_coefficients(a2):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def _add(C, A, a, M, B, b):  # type: ignore[no-untyped-def]
+    """C += a A - M + b B, all 3 x 3."""
+    for i in range(3):
+        for j in range(3):
+            C[i, j] += a * A[i, j] - M[i, j] + b * B[i, j]
+
+
+@njit(cache=True)
 def _integrate(edges, f, w, start, stop, bias, dt_out, dR_out, dv_out, dp_out, J_out, w_out):  # type: ignore[no-untyped-def]
     """Increments over (start[i], stop[i]] for samples holding f[k], w[k] on (edges[k], edges[k + 1]].
 
-    Intervals with equal start and non-decreasing stop continue each other.
+    Intervals with equal start and non-decreasing stop continue each other. Without Jacobians where J_out is empty.
     """
+    jacobians = len(J_out) == len(start)
     n_samples = len(f)
     dR, dv, dp, J = np.eye(3), np.zeros(3), np.zeros(3), np.zeros((5, 3, 3))
     E, Jr, A1, A2, F = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -100,29 +109,32 @@ def _integrate(edges, f, w, start, stop, bias, dt_out, dR_out, dv_out, dp_out, J
                     a2 += phi[c] * phi[c]
                 s1, s2, s3 = _rotation_coefficients(a2)
                 _polynomial(phi, 1.0, s1, s2, E)
-                _polynomial(phi, 1.0, -s2, s3, Jr)
                 _polynomial(wk, h, h * h / 2, h**3 / 6, A1)
                 _polynomial(wk, h * h / 2, h**3 / 6, h**4 / 24, A2)
                 for c in range(3):
                     av[c] = A1[c, 0] * fk[0] + A1[c, 1] * fk[1] + A1[c, 2] * fk[2]
                     ap[c] = A2[c, 0] * fk[0] + A2[c, 1] * fk[1] + A2[c, 2] * fk[2]
-                # positions before velocities, both before the rotation; d(A f)/dw f to leading order is enough here
-                _polynomial(fk, 0.0, 1.0, 0.0, F)
-                _mul(dR, F, T)
-                _polynomial(ap, 0.0, 1.0, 0.0, M)
-                _mul(dR, M, N)
-                _mul(N, J[0], M)
-                J[3] += J[1] * h - M + T * (h**3 / 6)
-                _mul(dR, A2, M)
-                J[4] += J[2] * h - M
-                _polynomial(av, 0.0, 1.0, 0.0, M)
-                _mul(dR, M, N)
-                _mul(N, J[0], M)
-                J[1] += T * (h * h / 2) - M
-                _mul(dR, A1, M)
-                J[2] -= M
-                _mul(E.T, J[0], M)
-                J[0] = M - Jr * h
+                if jacobians:
+                    # positions before velocities, both before the rotation; d(A f)/dw f to leading order is enough here
+                    _polynomial(phi, 1.0, -s2, s3, Jr)
+                    _polynomial(fk, 0.0, 1.0, 0.0, F)
+                    _mul(dR, F, T)
+                    _polynomial(ap, 0.0, 1.0, 0.0, M)
+                    _mul(dR, M, N)
+                    _mul(N, J[0], M)
+                    _add(J[3], J[1], h, M, T, h**3 / 6)
+                    _mul(dR, A2, M)
+                    _add(J[4], J[2], h, M, T, 0.0)
+                    _polynomial(av, 0.0, 1.0, 0.0, M)
+                    _mul(dR, M, N)
+                    _mul(N, J[0], M)
+                    _add(J[1], T, h * h / 2, M, T, 0.0)
+                    _mul(dR, A1, M)
+                    _add(J[2], T, 0.0, M, T, 0.0)
+                    _mul(E.T, J[0], M)
+                    for c in range(3):
+                        for d in range(3):
+                            J[0, c, d] = M[c, d] - Jr[c, d] * h
                 for c in range(3):
                     dp[c] += dv[c] * h + dR[c, 0] * ap[0] + dR[c, 1] * ap[1] + dR[c, 2] * ap[2]
                 for c in range(3):
@@ -133,7 +145,9 @@ def _integrate(edges, f, w, start, stop, bias, dt_out, dR_out, dv_out, dp_out, J
             if k < n_samples - 1 and t >= edges[k + 1]:
                 k += 1
         dt_out[i] = stop[i] - start[i]
-        dR_out[i], dv_out[i], dp_out[i], J_out[i], w_out[i] = dR, dv, dp, J, w[k]
+        dR_out[i], dv_out[i], dp_out[i], w_out[i] = dR, dv, dp, w[k]
+        if jacobians:
+            J_out[i] = J
 
 
 def gap_rows(t_s: Array) -> IntArray:
@@ -165,7 +179,10 @@ def sample_means(imu: ImuStream) -> tuple[Array, Array, Array]:
     the mean of the samples around it.
     """
     edges, f, w = _means(imu)
-    for i in gap_rows(imu.t_s):
+    missing = gap_rows(imu.t_s)
+    if imu.is_mean and len(missing):
+        f, w = f.copy(), w.copy()
+    for i in missing:
         around = slice(max(i + 1 - AROUND_GAP, 0), i + 1 + AROUND_GAP)
         f[i + 1], w[i + 1] = imu.f_b[around].mean(axis=0), imu.w_b[around].mean(axis=0)
     return edges, f, w
@@ -176,7 +193,7 @@ def _means(imu: ImuStream) -> tuple[Array, Array, Array]:
     first = t[0] - (t[1] - t[0]) if len(t) > 1 else t[0] - 1e-2
     edges = np.concatenate([[first], t])
     if imu.is_mean:
-        return edges, imu.f_b.copy(), imu.w_b.copy()
+        return edges, imu.f_b, imu.w_b
 
     def trapezoid(x: Array) -> Array:
         return np.concatenate([x[:1], 0.5 * (x[1:] + x[:-1])])
@@ -184,21 +201,32 @@ def _means(imu: ImuStream) -> tuple[Array, Array, Array]:
     return edges, trapezoid(imu.f_b), trapezoid(imu.w_b)
 
 
-def integrate(imu: ImuStream, start_s: Array, stop_s: Array, bias: Array) -> Increments:
-    """Increments over (start, stop] for each interval.
+def _around(imu: ImuStream, start_s: Array, stop_s: Array) -> ImuStream:
+    """The samples that intervals need, with as many around them as stand for a gap."""
+    if not len(start_s):
+        return imu
+    a = max(int(np.searchsorted(imu.t_s, start_s.min())) - AROUND_GAP - 2, 0)
+    b = int(np.searchsorted(imu.t_s, stop_s.max())) + AROUND_GAP + 2
+    if a == 0 and b >= len(imu.t_s):
+        return imu
+    return replace(imu, t_s=imu.t_s[a:b], f_b=imu.f_b[a:b], w_b=imu.w_b[a:b])
+
+
+def integrate(imu: ImuStream, start_s: Array, stop_s: Array, bias: Array, jacobians: bool = True) -> Increments:
+    """Increments over (start, stop] for each interval, with Jacobians to the biases unless told otherwise (then empty).
 
     start_s, stop_s (n,); bias (n, 6) gyroscope then accelerometer. Beyond the recording the outermost sample holds.
     Consecutive intervals with one start and increasing stops cost no more than the longest.
     """
     n = len(start_s)
-    edges, f, w = sample_means(imu)
     start, stop = np.asarray(start_s, float), np.asarray(stop_s, float)
+    edges, f, w = sample_means(_around(imu, start, stop))
     dt, dR, dv, dp, J, rate = (
         np.zeros(n),
         np.zeros((n, 3, 3)),
         np.zeros((n, 3)),
         np.zeros((n, 3)),
-        np.zeros((n, 5, 3, 3)),
+        np.zeros((n if jacobians else 0, 5, 3, 3)),
         np.zeros((n, 3)),
     )
     _integrate(edges, f, w, start, stop, np.asarray(bias, float), dt, dR, dv, dp, J, rate)
@@ -246,7 +274,7 @@ class GroupedInputs:
     dt_s: Array  # (m,)
 
 
-def gtsam_inputs(imu: ImuStream, start_s: Array, stop_s: Array, bias: Array) -> GroupedInputs:
+def grouped_inputs(imu: ImuStream, start_s: Array, stop_s: Array, bias: Array) -> GroupedInputs:
     """Mean inputs for the intervals (start, stop], exact at the end of every second step for the given bias (n, 6).
 
     With steps of length h and A_i = Exp(theta_i) a_i, GTSAM integrates theta <- theta + Jr(theta)^-1 w h,
@@ -260,7 +288,7 @@ def gtsam_inputs(imu: ImuStream, start_s: Array, stop_s: Array, bias: Array) -> 
     step = (np.arange(first[-1]) - first[interval] + 1) / count[interval]
     stops = start_s[interval] + (stop_s - start_s)[interval] * step
     stops[first[1:] - 1] = stop_s
-    inc = integrate(imu, start_s[interval], stops, bias[interval])
+    inc = integrate(imu, start_s[interval], stops, bias[interval], jacobians=False)
     m = len(interval)
     w_eff, a_eff, dt = np.zeros((m, 3)), np.zeros((m, 3)), np.zeros(m)
     is_first = np.zeros(m, bool)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from factorgraph.errors import InputError
+from factorgraph.models.clock_jumps import NO_JUMPS, ClockJumps, clock_jumps, with_phases_following
 from factorgraph.models.gnss import Prepared, SinglePoint, prepare, single_point, system_of, without_ionosphere
 from factorgraph.problem import Antenna, NavigationProblem, Vec3, Vehicle
 from factorgraph.start import interpolate
@@ -23,6 +24,7 @@ class Receiver:
     prepared: Prepared
     differenced: Prepared  # the same as the receiver's links difference them
     usable: BoolArray  # (n,) rows above the mask, strong enough, with a satellite state
+    jumps: ClockJumps = NO_JUMPS
 
     @property
     def antenna(self) -> Antenna:
@@ -45,12 +47,14 @@ def receivers(problem: NavigationProblem) -> dict[str, Receiver]:
     for v in problem.vehicles:
         if v.gnss is None:
             continue
-        stream = v.gnss.stream
+        stream, lags = with_phases_following(v.gnss.stream)
+        v = replace(v, gnss=replace(v.gnss, stream=stream)) if np.any(lags) else v
         if not np.any(np.isfinite(stream.sat_pos_ecef)):
             raise InputError(
                 f"vehicle {v.name}: no satellite has an ephemeris; check that the navigation file covers the flight's time"
             )
         klobuchar = stream.klobuchar if settings.ionosphere_model != "none" else None
+        assert v.gnss is not None
         point = single_point(stream, v.gnss.noise, settings.systems, klobuchar, problem.t0.sow)
         good = np.isfinite(point.clock_s)
         if not np.any(good):
@@ -64,7 +68,7 @@ def receivers(problem: NavigationProblem) -> dict[str, Receiver]:
             r_n = np.tile(np.asarray(v.fixed_n, float), (len(stream.t_s), 1))
         else:
             r_n = interpolate(stream.t_s, stream.t_s, problem.frame.from_ecef(point.r_ecef))
-        out[v.name] = corrected(problem, v, point, clock, r_n)
+        out[v.name] = replace(corrected(problem, v, point, clock, r_n), jumps=clock_jumps(stream.t_s, point.clock_s, lags))
     return out
 
 
@@ -73,7 +77,8 @@ def corrected(problem: NavigationProblem, vehicle: Vehicle, point: SinglePoint, 
     assert vehicle.gnss is not None
     stream, noise, settings = vehicle.gnss.stream, vehicle.gnss.noise, problem.settings
     klobuchar = stream.klobuchar if settings.ionosphere_model != "none" else None
-    prepared = prepare(stream, problem.frame, r_n, clock_s, klobuchar, problem.t0.sow)
+    day = problem.t0.day_of_year if settings.troposphere_mapping == "niell" else None
+    prepared = prepare(stream, problem.frame, r_n, clock_s, klobuchar, problem.t0.sow, day)
     usable = (
         np.isin(system_of(stream), list(settings.systems))
         & (prepared.elevation_rad >= noise.elevation_mask_rad)

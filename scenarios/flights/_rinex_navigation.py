@@ -98,7 +98,7 @@ def _ephemeris(text: RinexText, begin: int, end: int, into: Messages) -> None:
         return
     n = orbits.N_GLONASS if system == "R" else orbits.N_KEPLER
     values = _numbers(text, begin, end, epoch_end, n)
-    problem = _unusable(values, system)
+    problem = unusable(values, system)
     if problem:
         into.dropped[problem] += 1
         into.notes.append(f"line {begin + 1}: {problem}")
@@ -120,7 +120,7 @@ def _numbers(text: RinexText, begin: int, end: int, first_column: int, n: int) -
     return values
 
 
-def _unusable(values: Array, system: str) -> str:
+def unusable(values: Array, system: str) -> str:
     """Why a record cannot be used, or nothing."""
     needed = range(14) if system == "R" else (0, 1, 2, *range(orbits.CRS, orbits.I_DOT + 1), orbits.HEALTH)
     if not np.all(np.isfinite(values[list(needed)])):

@@ -56,7 +56,7 @@ def read_rinex(path: Path) -> RinexText:
 
     Raises InputError for files that are absent, empty, not RINEX, of an unknown version or cut inside the header.
     """
-    data, remarks = _unpacked(path)
+    data, remarks = unpacked(path)
     if not data.strip():
         raise InputError(f"{path}: the file is empty")
     starts, ends = line_bounds(data)
@@ -85,7 +85,8 @@ def line_bounds(data: bytes) -> tuple[IntArray, IntArray]:
     return starts.astype(np.int64), ends.astype(np.int64)
 
 
-def _unpacked(path: Path) -> tuple[bytes, tuple[str, ...]]:
+def unpacked(path: Path) -> tuple[bytes, tuple[str, ...]]:
+    """A file's bytes, decompressed, and remarks on damage. Raises InputError where it cannot be read."""
     try:
         data = path.read_bytes()
     except OSError as e:

@@ -50,8 +50,10 @@ def check(flight: LoadedFlight) -> list[CheckTable]:
     settings = problem.settings.ambiguity
     tables = [
         CheckTable("flight", f"Flight {problem.name}", ("what", "value"), tuple(_facts(flight))),
+        CheckTable("findings", "Wrong or doubtful", ("of", "what", "how bad"), tuple(_finding_rows(flight))),
         CheckTable("sensors", "Sensors", SENSOR_COLUMNS, tuple(_sensor_row(*s) for s in _sensors(flight))),
         CheckTable("gaps", "Gaps", ("sensor", "from s", "to s", "length s"), tuple(_gap_rows(flight))),
+        CheckTable("offsets", "Times of sensors against each other", OFFSET_COLUMNS, tuple(_offset_rows(flight))),
         CheckTable("overlaps", "Common time", ("first", "second", "from s", "to s", "length s"), tuple(_overlap_rows(flight))),
         CheckTable("satellites", "Satellites", SATELLITE_COLUMNS, tuple(row for r in receivers for row in _satellite_rows(*r))),
         CheckTable("slips", "Cycle slips", SLIP_COLUMNS, tuple(row for r in receivers for row in _slip_rows(*r, settings))),
@@ -97,6 +99,21 @@ def _text(cell: Cell) -> str:
 # flight and sensors
 
 
+def _finding_rows(flight: LoadedFlight) -> Iterator[tuple[Cell, ...]]:
+    for finding in flight.examined.findings:
+        yield finding.subject, finding.text, "cannot be right" if finding.is_wrong else "doubtful"
+
+
+OFFSET_COLUMNS = ("vehicle", "sensor", "against", "late by s", "sigma s", "misfit m/s2", "told %")
+
+
+def _offset_rows(flight: LoadedFlight) -> Iterator[tuple[Cell, ...]]:
+    for c in flight.examined.offsets:
+        o = c.offset
+        numbers = round(o.offset_s, 3), round(o.sigma_s, 3), round(o.misfit_mps2, 3), round(100 * o.contrast)
+        yield c.vehicle, c.sensor, c.against, *numbers
+
+
 def _facts(flight: LoadedFlight) -> Iterator[tuple[Cell, ...]]:
     problem = flight.problem
     frame = problem.frame
@@ -132,14 +149,14 @@ def _sensors(flight: LoadedFlight) -> Iterator[tuple[str, Array]]:
             yield f"{v.name} imu", v.imu.t_s
         if v.gnss is not None:
             yield f"{v.name} gnss", v.gnss.stream.t_s
-        for fixes in v.positions:
-            yield f"{v.name} {fixes.name}", fixes.t_s
-        for heights in v.heights:
-            yield f"{v.name} {heights.name}", heights.t_s
+        for streams in (v.positions, v.heights, v.velocities, v.attitudes, v.magnetics):
+            yield from ((f"{v.name} {stream.name}", stream.t_s) for stream in streams)
         if v.truth is not None:
             yield f"{v.name} truth", v.truth.t_s
     for model in flight.problem.ranges:
         yield f"ranges {model.stream.name}", np.unique(model.stream.t_s)
+    for vision in flight.problem.visions:
+        yield f"vision {vision.name}", vision.t_s
 
 
 SENSOR_COLUMNS = ("sensor", "samples", "rate Hz", "from s", "to s", "gaps", "longest gap s")

@@ -11,7 +11,8 @@ the one observed (RTKLIB: the TGD of prange):
     BeiDou      B1I and B1C TGD1, B2I and B2a TGD2, B3I none
     GLONASS     -(tau L2 - tau L1) / (gamma - 1), gamma = (f1 / f2)^2; times gamma on L2
 
-Galileo satellites with I/NAV records use those only, others F/NAV.
+Galileo satellites with I/NAV records use those only, others F/NAV. SP3 orbits (`flights.sp3`) have clocks of the same reference
+signals but for Galileo, E1 and E5a, which the BGDs of I/NAV miss by nanoseconds.
 
 Source: IS-GPS-200, 20.3.3.3; Galileo OS SIS ICD, 5.1.5; BDS-SIS-ICD-2.1, 5.2.4.10.
 """
@@ -34,7 +35,10 @@ from scenarios.flights import _orbits as orbits
 from scenarios.flights._orbits import GlonassSet, KeplerSet, OrbitClock
 from scenarios.flights._rinex_navigation import GLONASS_UNKNOWN, Messages, read_messages
 from scenarios.flights._rinex_text import BDT_GPST_S, read_rinex
+from scenarios.flights._ubx_navigation import read_ubx_messages
 from scenarios.flights.signals import carrier_hz
+from scenarios.flights.sp3 import PreciseOrbits, is_sp3, read_sp3
+from scenarios.flights.ubx import is_ubx
 
 CONSTELLATION = Path(__file__).resolve().parent.parent / "data" / "constellation.rnx"
 BDT_WEEK = 1356  # GPS week in which BeiDou's count begins
@@ -61,12 +65,14 @@ class Navigation:
     kepler: KeplerSet
     glonass: GlonassSet
     klobuchar: Array | None = None  # (8,) GPS alpha, beta (BeiDou's or QZSS's where GPS has none)
+    precise: PreciseOrbits | None = None  # used in place of the messages where they cover
     report: ReadReport = field(default_factory=lambda: ReadReport("", 0))
 
     @cached_property
     def satellites(self) -> tuple[str, ...]:
         """Satellites that have a record."""
-        return tuple(sorted({*self.kepler.satellites, *self.glonass.satellites}))
+        precise = self.precise.satellites if self.precise is not None else ()
+        return tuple(sorted({*self.kepler.satellites, *self.glonass.satellites, *precise}))
 
     @cached_property
     def glonass_channels(self) -> dict[str, int]:
@@ -83,7 +89,7 @@ class Navigation:
         record = self._records(satellites, sat, t_sv)
         offset = np.zeros_like(t_sv)
         for _ in range(2):
-            offset = self._clock_s(record, t_sv - offset)
+            offset = self._clock_s(satellites, sat, record, t_sv - offset)
         return self._states(satellites, sat, record, t_sv - offset)
 
     def states_at(self, satellites: tuple[str, ...], sat: IntArray, t0: GpsTime, t_s: Array) -> SatelliteStates:
@@ -146,7 +152,7 @@ class Navigation:
         glonass = GlonassSet(
             tuple(self.glonass.satellites[i] for i in newest), np.full(len(newest), quarter), self.glonass.data[newest]
         )
-        return replace(self, t_ref=hour, kepler=kepler, glonass=glonass)
+        return replace(self, t_ref=hour, kepler=kepler, glonass=glonass, precise=None)
 
     def _records(self, satellites: tuple[str, ...], sat: IntArray, t: Array) -> IntArray:
         """Healthy record in use at t (seconds since t_ref), -1 none."""
@@ -169,14 +175,17 @@ class Navigation:
             (len(k.satellites), _ranges(g.satellites), g.toe_s, g.data[:, orbits.G_HEALTH] == 0),
         )
 
-    def _clock_s(self, record: IntArray, t: Array) -> Array:
-        """Polynomial clock offsets; zero without a record."""
+    def _clock_s(self, satellites: tuple[str, ...], sat: IntArray, record: IntArray, t: Array) -> Array:
+        """Clock offsets without relativity; zero where they are unknown."""
         offset = np.zeros(len(t))
         n_kepler = len(self.kepler.satellites)
         k, g = np.flatnonzero((record >= 0) & (record < n_kepler)), np.flatnonzero(record >= n_kepler)
         rk, rg = record[k], record[g] - n_kepler
         offset[k] = orbits.kepler_clock_s(np.take(self.kepler.data.T, rk, axis=1), t[k] - self.kepler.toc_s[rk])
         offset[g] = orbits.glonass_clock_s(np.take(self.glonass.data.T, rg, axis=1), t[g] - self.glonass.toe_s[rg])
+        if self.precise is not None:
+            covered, node = self.precise.covers(satellites, sat, t)
+            offset[covered] = np.nan_to_num(self.precise.clock_at(node[covered], t[covered])[0])
         return offset
 
     def _states(self, satellites: tuple[str, ...], sat: IntArray, record: IntArray, t: Array) -> SatelliteStates:
@@ -196,6 +205,9 @@ class Navigation:
         if g.size:
             rg = record[g] - n_kepler
             put(g, orbits.glonass_states(np.take(self.glonass.data.T, rg, axis=1), t[g] - self.glonass.toe_s[rg]))
+        if self.precise is not None:
+            covered, node = self.precise.covers(satellites, sat, t)
+            put(np.flatnonzero(covered), OrbitClock(*self.precise.states(node[covered], t[covered])))
         return SatelliteStates(pos, vel, clock * C_MPS, rate * C_MPS, record)
 
 
@@ -212,17 +224,25 @@ def turned_range(sat_ecef: Array, r_ecef: Array) -> Array:
 
 
 def read_navigation(paths: Sequence[Path]) -> Navigation:
-    """Read RINEX 2.11, 3.x or 4 navigation files (plain, gzip, Unix compress) into one set.
+    """Read RINEX 2.11, 3.x or 4 navigation files, SP3 orbits (plain, gzip, Unix compress) and u-blox logs into one set.
 
+    Where SP3 orbits cover a satellite they are used in place of its messages, which still give the group delays.
     Duplicate records are kept once. Raises InputError for files that cannot be read as navigation data or hold no
     usable record; records that cannot be used are counted in `report`.
     """
     if not paths:
         raise InputError("no navigation file given")
     messages = Messages()
-    for path in paths:
-        read_messages(read_rinex(Path(path)), messages)
+    files = [Path(path) for path in paths]
+    sp3 = [path for path in files if is_sp3(path)]
+    for path in files:
+        if is_ubx(path):
+            read_ubx_messages(path, messages)
+        elif path not in sp3:
+            read_messages(read_rinex(path), messages)
     source = ", ".join(str(p) for p in paths)
+    if sp3:
+        return _with_precise(sp3, messages, source)
     if not messages.satellites:
         reasons = "; ".join(f"{n} x {why}" for why, n in messages.dropped.items())
         raise InputError(f"{source}: no usable navigation message" + (f" ({reasons})" if reasons else ""))
@@ -233,6 +253,22 @@ def read_navigation(paths: Sequence[Path]) -> Navigation:
 def builtin_constellation() -> Navigation:
     """The constellations the simulator uses: GPS, Galileo, BeiDou and QZSS, one message per satellite."""
     return read_navigation([CONSTELLATION])
+
+
+def _with_precise(sp3: Sequence[Path], messages: Messages, source: str) -> Navigation:
+    """SP3 orbits, with the broadcast messages beside them where there are any."""
+    precise, t_ref, report = read_sp3(sp3)
+    if not messages.satellites:
+        kepler = KeplerSet((), np.zeros(0), np.zeros(0), np.zeros((0, orbits.N_KEPLER)))
+        glonass = GlonassSet((), np.zeros(0), np.zeros((0, orbits.N_GLONASS)))
+        klobuchar = next((messages.klobuchar[s] for s in "GCJ" if s in messages.klobuchar), None)
+        note = "no broadcast messages beside SP3 orbits: group delays are unknown, of GPS several metres"
+        return Navigation(t_ref, kepler, glonass, klobuchar, precise, replace(report, notes=(*report.notes, note)))
+    broadcast = _assembled(messages, source)
+    own = broadcast.report
+    shift = t_ref - broadcast.t_ref
+    both = ReadReport(source, own.n_rows + report.n_rows, {**own.dropped, **report.dropped}, own.notes)
+    return replace(broadcast, precise=replace(precise, t_s=precise.t_s + shift), report=both)
 
 
 def _assembled(messages: Messages, source: str) -> Navigation:
@@ -266,7 +302,7 @@ def _assembled(messages: Messages, source: str) -> Navigation:
     )
     klobuchar = next((messages.klobuchar[s] for s in "GCJ" if s in messages.klobuchar), None)
     return Navigation(
-        t_ref, kepler, glonass, klobuchar, ReadReport(source, len(rows), dict(messages.dropped), tuple(messages.notes))
+        t_ref, kepler, glonass, klobuchar, None, ReadReport(source, len(rows), dict(messages.dropped), tuple(messages.notes))
     )
 
 

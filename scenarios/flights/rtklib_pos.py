@@ -2,7 +2,8 @@
 
 Header lines begin with "%"; the last of them names the time system (GPST or UTC) and the columns. Times are calendar
 dates or week and seconds. A standard deviation of two axes is sign(cov) sqrt(|cov|). Baselines count from the
-reference position of the header ("% ref pos").
+reference position of the header ("% ref pos"). Velocities and their standard deviations may follow the ratio
+(out-outvel), in the axes of the positions.
 
 Source: RTKLIB 2.4.3 manual, appendix B.1.
 """
@@ -23,7 +24,7 @@ from scenarios.flights.tables import Times, read_bytes
 
 Kind = Literal["llh", "ecef", "enu"]
 MARKS: tuple[tuple[str, Kind], ...] = (("latitude", "llh"), ("x-ecef", "ecef"), ("e-baseline", "enu"))
-N_VALUES = 13  # position 3, Q, ns, standard deviations 6, age, ratio
+N_VALUES = 22  # position 3, Q, ns, standard deviations 6, age, ratio; velocity 3 and standard deviations 6 where asked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +38,8 @@ class PosFile:
     quality: IntArray  # (n,) 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP
     n_sat: IntArray  # (n,)
     ratio: Array  # (n,)
+    velocity: Array  # (n, 3) east-north-up, ECEF for kind "ecef" [m/s]; NaN where absent
+    velocity_cov: Array  # (n, 3, 3) in the same axes [m^2/s^2]
     reference_ecef: Array | None  # (3,) of the header
     n_rows: int
     dropped: dict[str, int]
@@ -54,6 +57,12 @@ class PosFile:
     def cov_enu(self, C_en_: Array) -> Array:
         """Covariances (n, 3, 3) east-north-up, with the rotation (3, 3) for those in ECEF."""
         return np.asarray(C_en_ @ self.cov @ C_en_.T) if self.kind == "ecef" else self.cov
+
+    def velocity_enu(self, C_en_: Array) -> tuple[Array, Array]:
+        """Velocities (n, 3) and their covariances (n, 3, 3) east-north-up, with the rotation for those in ECEF."""
+        if self.kind != "ecef":
+            return self.velocity, self.velocity_cov
+        return self.velocity @ C_en_.T, np.asarray(C_en_ @ self.velocity_cov @ C_en_.T)
 
 
 def _C_en(r_ecef: Array) -> Array:
@@ -87,6 +96,8 @@ def read_pos(path: Path) -> PosFile:
         values[:, 3].astype(np.int64),
         values[:, 4].astype(np.int64),
         values[:, 12],
+        values[:, [14, 13, 15]] if kind == "llh" else values[:, 13:16],
+        _covariances(values[:, 16:22], kind),
         _reference(header),
         len(body),
         dropped,

@@ -1,8 +1,10 @@
 """`flight.toml`: what a flight folder declares, checked key by key.
 
     [flight]     name, t0, origin, where the files are, part of the recording to use
-    [[vehicle]]  name, body axes, imu, imu_noise, gnss, positions, heights, motion, fixed, truth
+    [[vehicle]]  name, body axes, imu, imu_noise, imu_calibration, gnss, positions, heights, velocities, attitudes,
+                 magnetometers, constraints, motion, fixed, truth
     [[range]]    a set of ranges between tags
+    [[vision]]   directions and ranges from a camera or radar on a vehicle
     [[link]]     a pair whose GNSS observations are differenced
     [[pair]]     a pair whose relative solution is wanted
     [settings]   the fields of `factorgraph.problem.Settings`
@@ -43,7 +45,18 @@ from factorgraph.attitude import matrix_from_euler
 from factorgraph.errors import InputError
 from factorgraph.geodesy import LocalFrame, ecef_from_geodetic
 from factorgraph.gpstime import GpsTime
-from factorgraph.problem import Elevation, GnssNoise, ImuNoise, MotionPrior, Settings, Vec3
+from factorgraph.measurements import Calibration
+from factorgraph.problem import (
+    HEADING_SIGMA_RAD,
+    Constraints,
+    Elevation,
+    GnssNoise,
+    ImuCalibration,
+    ImuNoise,
+    MotionPrior,
+    Settings,
+    Vec3,
+)
 from factorgraph.types import Array
 
 FILE_NAME = "flight.toml"
@@ -155,6 +168,7 @@ class TimeColumn(Table):
     scale: float = 1.0
     offset_s: float = 0.0
     epoch: Epoch = "flight"
+    tag: str = ""  # RTKLIB time tag file beside a text file whose column is a counter; `epoch` is not used then
 
 
 Time = Annotated[TimeColumn, BeforeValidator(_time_shorthand)]
@@ -200,6 +214,7 @@ class TextOptions(Table):
     header: bool = True
     skip_rows: int = Field(default=0, ge=0)  # lines before the header or the first row
     comment: str = ""  # lines that start with it are left out
+    only: str = ""  # where given, lines that start with it are read and all others left out
     variable: str = ""  # of the MATLAB file
 
 
@@ -233,8 +248,9 @@ class Imu(TextOptions):
     file: str
     format: Literal["csv", "mat"] = "csv"
     time: Time = TimeColumn()
-    accel: Columns3 = (1, 2, 3)
-    gyro: Columns3 = (4, 5, 6)
+    accel: Columns3 | Literal["level"] = (1, 2, 3)  # "level": none; gravity along the body's up axis stands in
+    gyro: Columns3 | Column = (4, 5, 6)  # one column: the rate about the up axis, to the left
+    gyro_increments: bool = False  # cells are angles turned since the row before, in rad or deg
     accel_unit: Literal["m/s2", "g"] = "m/s2"
     gyro_unit: Literal["rad/s", "deg/s"] = "rad/s"
     axes: Axes = "RFU"
@@ -246,6 +262,22 @@ class Imu(TextOptions):
     def C_bs(self) -> Array:
         """Rotation (3, 3) from the columns' axes to right-front-up."""
         return self.mounting.C @ axes_matrix(self.axes)
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """The columns of the accelerometers, where there are, and of the gyroscopes."""
+        return (*(() if self.accel == "level" else self.accel), *self.gyro_columns)
+
+    @property
+    def gyro_columns(self) -> tuple[Column, ...]:
+        """One or three."""
+        return self.gyro if isinstance(self.gyro, tuple) else (self.gyro,)
+
+    @model_validator(mode="after")
+    def _tag_of_text(self) -> Imu:
+        if self.time.tag and self.format != "csv":
+            raise InputError("imu: time.tag belongs to a text file")
+        return self
 
 
 _DEG, _HOUR = math.pi / 180, 3600.0
@@ -339,30 +371,98 @@ def _as_list(value: object) -> object:
 
 
 Files = Annotated[tuple[str, ...], BeforeValidator(_as_list)]
+NonNegative = Annotated[float, Field(ge=0)]
+
+
+def _check_satellites(names: dict[str, str]) -> dict[str, str]:
+    for cell, name in names.items():
+        if len(name) != 3 or name[0] not in SYSTEMS or not name[1:].isdigit():
+            raise InputError(f'names: "{cell}" is named "{name}"; write a RINEX name such as "G05" or "J02"')
+    return names
+
+
+def _check_systems(systems: dict[str, str]) -> dict[str, str]:
+    for cell, letter in systems.items():
+        if len(letter) != 1 or letter not in SYSTEMS:
+            raise InputError(f'systems: "{cell}" is "{letter}"; write one letter of {SYSTEMS}')
+    return systems
+
+
+class SatelliteTable(TextOptions):
+    """Columns of a table with a row per epoch and satellite, and what was done to them; see `satellite_table`."""
+
+    kind: Literal["csv", "mat"] = "csv"
+    time: Time = TimeColumn()
+    satellite: Column = "satellite"  # a RINEX name or a number
+    system: Column | None = None
+    default_system: Literal["G", "R", "E", "J", "C"] = "G"  # of numbers without a system column
+    systems: Annotated[dict[str, str], AfterValidator(_check_systems)] = {}  # cell of the system column -> letter
+    number_offset: dict[Literal["G", "R", "E", "J", "C"], int] = {}  # taken off a system's numbers
+    names: Annotated[dict[str, str], AfterValidator(_check_satellites)] = {}  # satellite cell -> RINEX name
+    signal: str = Field(default="1C", pattern="^[0-9][A-Z]$")
+    code: Column
+    range_rate: Column | None = None  # positive receding [m/s]
+    cn0: Column | None = None
+    position: Columns3  # ECEF
+    velocity: Columns3 | None = None
+    clock: Column | None = None  # satellite's, times the speed of light; default: taken off the pseudoranges
+    clock_rate: Column | None = None
+    turned: Literal["no", "range", "pseudorange"] = "no"  # by the Earth's rotation during the travel time, from ...
+    velocity_turned: bool = False
+    troposphere_removed: bool = False
+    group_delay_removed: bool = True  # false: the delays of gnss.nav are taken off
+    true_time: bool = False  # the receiver's clock is off the times, but in the pseudoranges
 
 
 class Gnss(Table):
-    """A receiver: RINEX observations and the navigation messages to use with them."""
+    """A receiver: its observations and, for RINEX and UBX, the navigation messages to use with them."""
 
     obs: str
-    nav: Files = ()  # default: the navigation files of the other receivers
+    format: Literal["rinex", "ubx", "satellite-table"] = "rinex"
+    table: SatelliteTable | None = None
+    nav: Files = ()  # default: the navigation files of the other receivers, else the messages in UBX logs
     lever_b: Vec3 = (0.0, 0.0, 0.0)
+    lever_sigma_m: NonNegative = 0.0
+    time_sigma_s: NonNegative = 0.0
     noise: GnssNoiseTable = GnssNoiseTable()
+
+    @model_validator(mode="after")
+    def _table_with_its_format(self) -> Gnss:
+        if (self.format == "satellite-table") != (self.table is not None):
+            raise InputError('gnss: format = "satellite-table" and the columns in gnss.table belong together')
+        return self
+
+    @property
+    def calibration(self) -> Calibration:
+        return Calibration(lever_m=self.lever_sigma_m, time_s=self.time_sigma_s)
 
 
 class Positions(TextOptions):
     """Position fixes of an antenna."""
 
     file: str
-    format: Literal["csv", "mat", "rtklib-pos", "nmea"] = "csv"
+    format: Literal["csv", "mat", "rtklib-pos", "nmea", "ubx"] = "csv"
     name: str = "position"
     time: Time = TimeColumn()
     position: Columns3 = (1, 2, 3)
     frame: AxisFrame = "local"
     sigma: Columns3 | None = None  # columns, per axis of east-north-up
     sigma_m: Vec3 | None = None  # default: the file's own, else 3, 3, 6 m
+    sigma_scale: PositiveFloat = 1.0  # of positions and velocities: receivers may be too confident
+    velocity: Columns3 | None = None  # columns, in the axes of `frame` (llh: east, north, up); RTKLIB files have their own
+    velocity_sigma_mps: Vec3 | None = None  # per axis of east-north-up; default: the file's own, else 0.1, 0.1, 0.2 m/s
+    velocity_offset_s: float = 0.0  # from the time of the position to the one at which its velocity holds
+    use_velocity: bool = True  # where there is one
+    quality: Column | None = None  # column of the kind of fix; RTKLIB files and UBX have their own
+    qualities: tuple[int, ...] = ()  # kinds of fix used; default: all
     date: str = ""  # of an NMEA file without dates: "2021-09-22" (UTC)
     lever_b: Vec3 = (0.0, 0.0, 0.0)
+    lever_sigma_m: NonNegative = 0.0  # what is estimated beside the states: prior standard deviations
+    time_sigma_s: NonNegative = 0.0
+
+    @property
+    def calibration(self) -> Calibration:
+        return Calibration(lever_m=self.lever_sigma_m, time_s=self.time_sigma_s)
 
 
 class Heights(TextOptions):
@@ -383,6 +483,13 @@ class Heights(TextOptions):
     valid_max: float = math.inf
     sigma_m: PositiveFloat = 1.0
     lever_b: Vec3 = (0.0, 0.0, 0.0)
+    bias_sigma_m: NonNegative = 0.0  # a barometer has a bias that walks
+    bias_walk_m_rts: NonNegative = 0.0
+    time_sigma_s: NonNegative = 0.0
+
+    @property
+    def calibration(self) -> Calibration:
+        return Calibration(bias=self.bias_sigma_m, bias_walk=self.bias_walk_m_rts, time_s=self.time_sigma_s)
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True)
 
@@ -406,6 +513,9 @@ class TruthTable(TextOptions):
     quaternion: tuple[Column, Column, Column, Column] | None = None  # the vehicle's axes to `frame`
     quaternion_order: Literal["wxyz", "xyzw"] = "wxyz"
     frame: AxisFrame = "local"
+    quality: Column | None = None  # column of the kind of fix; RTKLIB files have their own
+    qualities: tuple[int, ...] = ()  # kinds of fix that count as truth; default: all
+    lever_b: Vec3 | None = None  # of the point whose trajectory this is; default: the origin of the lever arms
     date: str = ""
 
     @model_validator(mode="after")
@@ -415,6 +525,139 @@ class TruthTable(TextOptions):
         if self.quaternion is not None and self.frame not in ("local", "ned"):
             raise InputError(f"truth: attitudes are read with frame local or ned, not {self.frame}")
         return self
+
+
+class ImuCalibrationTable(Table):
+    """What the flight estimates of an IMU; see `factorgraph.problem.ImuCalibration`."""
+
+    time_sigma_s: NonNegative = 0.0
+    gyro_scale_sigma: NonNegative = 0.0
+    accel_scale_sigma: NonNegative = 0.0
+
+    @property
+    def calibration(self) -> ImuCalibration:
+        return ImuCalibration(self.time_sigma_s, self.gyro_scale_sigma, self.accel_scale_sigma)
+
+
+class Velocities(TextOptions):
+    """Velocities along the axes of a sensor on the vehicle: an odometer has one component."""
+
+    file: str
+    format: Literal["csv", "mat"] = "csv"
+    name: str = "odometer"
+    time: Time = TimeColumn()
+    forward: Column | None = None  # speed along the sensor's forward axis
+    velocity: Columns3 | None = None  # or all components, along `axes`
+    unit: Literal["m/s", "km/h"] = "m/s"
+    scale: float = 1.0
+    increments: bool = False  # cells are distances travelled since the row before [m]
+    axes: Axes = "RFU"
+    mounting: Mounting = Mounting()
+    sigma_mps: PositiveFloat = 0.1
+    lever_b: Vec3 = (0.0, 0.0, 0.0)
+    lever_sigma_m: NonNegative = 0.0  # what is estimated beside the states: prior standard deviations
+    time_sigma_s: NonNegative = 0.0
+    scale_sigma: NonNegative = 0.0
+    mounting_sigma_deg: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Velocities:
+        if (self.forward is None) == (self.velocity is None):
+            raise InputError("velocities: give either forward (one column) or velocity (three)")
+        if self.forward is not None and self.mounting != Mounting():
+            raise InputError("velocities: a mounting turns all three components; give velocity rather than forward")
+        return self
+
+    @property
+    def calibration(self) -> Calibration:
+        return Calibration(
+            lever_m=self.lever_sigma_m,
+            time_s=self.time_sigma_s,
+            scale=self.scale_sigma,
+            mounting_rad=math.radians(self.mounting_sigma_deg),
+        )
+
+
+class Attitudes(TextOptions):
+    """Attitude from a reference system, a two-antenna compass or the like."""
+
+    file: str
+    format: Literal["csv", "mat"] = "csv"
+    name: str = "attitude"
+    time: Time = TimeColumn()
+    quaternion: tuple[Column, Column, Column, Column] | None = None  # the vehicle's axes to `frame`
+    quaternion_order: Literal["wxyz", "xyzw"] = "wxyz"
+    frame: Literal["local", "ned"] = "local"
+    rpy: Columns3 | None = None  # or roll (right side down), pitch (nose up) and heading (clockwise from north)
+    heading: Column | None = None  # or the heading alone
+    unit: Literal["deg", "rad"] = "deg"
+    offset_deg: float = 0.0  # added to headings
+    sigma_deg: Vec3 = (0.5, 0.5, 1.0)  # of the rotation error about east, north and up
+    tells: Literal["all", "tilt", "heading"] = "all"
+    time_sigma_s: NonNegative = 0.0
+    mounting_sigma_deg: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Attitudes:
+        if sum(way is not None for way in (self.quaternion, self.rpy, self.heading)) != 1:
+            raise InputError("attitudes: give one of quaternion, rpy and heading")
+        if min(self.sigma_deg) <= 0:
+            raise InputError(f"attitudes: sigma_deg must be positive, got {list(self.sigma_deg)}")
+        if self.heading is not None and self.tells == "tilt":
+            raise InputError("attitudes: a heading does not tell the tilt")
+        return self
+
+    @property
+    def calibration(self) -> Calibration:
+        return Calibration(time_s=self.time_sigma_s, mounting_rad=math.radians(self.mounting_sigma_deg))
+
+
+class Magnetometers(TextOptions):
+    """Magnetic field along the axes of a sensor; the unit is that of the reference field."""
+
+    file: str
+    format: Literal["csv", "mat"] = "csv"
+    name: str = "magnetometer"
+    time: Time = TimeColumn()
+    field: Columns3
+    scale: float = 1.0
+    axes: Axes = "RFU"
+    mounting: Mounting = Mounting()
+    field_m: Vec3  # Earth's field along the recording's local axes
+    sigma: PositiveFloat
+    min_interval_s: NonNegative = 0.0
+    bias_sigma: NonNegative = 0.0  # hard iron
+    mounting_sigma_deg: NonNegative = 0.0
+
+    @property
+    def calibration(self) -> Calibration:
+        return Calibration(bias=self.bias_sigma, mounting_rad=math.radians(self.mounting_sigma_deg))
+
+
+class ConstraintsTable(Table):
+    """What is known of how a vehicle moves; see `factorgraph.problem.Constraints`."""
+
+    lateral_mps: NonNegative = 0.0
+    vertical_mps: NonNegative = 0.0
+    axle_b: Vec3 = (0.0, 0.0, 0.0)
+    mounting_sigma_deg: NonNegative = 0.0
+    zero_velocity_mps: NonNegative = 0.0
+    zero_rotation_dps: NonNegative = 0.0
+    height_mps: NonNegative = 0.0
+    interval_s: PositiveFloat = 0.5
+
+    def constraints(self, axle_b: Vec3) -> Constraints:
+        """In SI units, the axle point from the body origin."""
+        return Constraints(
+            self.lateral_mps,
+            self.vertical_mps,
+            axle_b,
+            math.radians(self.mounting_sigma_deg),
+            self.zero_velocity_mps,
+            math.radians(self.zero_rotation_dps),
+            self.height_mps,
+            self.interval_s,
+        )
 
 
 class Motion(Table):
@@ -461,13 +704,20 @@ class VehicleTable(Table):
     axes: Axes = "RFU"  # of its lever arms and truth attitudes
     imu: Imu | None = None
     imu_noise: ImuNoiseTable = ImuNoiseTable()
+    imu_calibration: ImuCalibrationTable = ImuCalibrationTable()
     gnss: Gnss | None = None
     positions: tuple[Positions, ...] = ()
     heights: tuple[Heights, ...] = ()
+    velocities: tuple[Velocities, ...] = ()
+    attitudes: tuple[Attitudes, ...] = ()
+    magnetometers: tuple[Magnetometers, ...] = ()
+    constraints: ConstraintsTable = ConstraintsTable()
     motion: Motion | None = None
     fixed: Fixed | None = None
     truth: TruthTable | None = None
-    heading_hint_deg: float | None = None
+    heading_hint_deg: float | None = None  # of the first state
+    heading_sigma_deg: PositiveFloat = math.degrees(HEADING_SIGMA_RAD)  # of it
+    carrier: str | None = None  # a further antenna of that vehicle: `gnss` alone, its lever arm in the carrier's axes
 
 
 class TagTable(Table):
@@ -500,9 +750,44 @@ class Ranges(TextOptions):
     sigma: Column | None = None
     sigma_m: PositiveFloat = 0.15
     tags: tuple[TagTable, ...]
-    bias_sigma_m: float = Field(default=0.0, ge=0)
-    scale_sigma: float = Field(default=0.0, ge=0)
+    bias_sigma_m: NonNegative = 0.0
+    scale_sigma: NonNegative = 0.0
     per_pair: bool = False
+    lever_sigma_m: NonNegative = 0.0  # of every carried tag
+    time_sigma_s: NonNegative = 0.0  # of the whole set
+
+
+class Vision(TextOptions):
+    """Azimuth, elevation and range of a target, seen along the axes of the observer's vehicle (right, front, up)."""
+
+    name: str = "vision"
+    file: str
+    format: Literal["csv", "mat"] = "csv"
+    time: Time = TimeColumn()
+    observer: TagTable
+    target: TagTable
+    azimuth: Column | None = None  # clockwise from forward
+    elevation: Column | None = None  # up from the right-forward plane
+    range: Column | None = None
+    unit: Literal["deg", "rad"] = "deg"
+    sigma_deg: PositiveFloat = 0.5
+    sigma_m: PositiveFloat = 1.0
+    time_sigma_s: NonNegative = 0.0
+    mounting_sigma_deg: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _something(self) -> Vision:
+        if self.azimuth is None and self.elevation is None and self.range is None:
+            raise InputError(f"vision {self.name}: give azimuth, elevation or range")
+        if self.observer.vehicle is None:
+            raise InputError(f"vision {self.name}: the observer {self.observer.name} must be on a vehicle")
+        if self.observer.vehicle == self.target.vehicle:
+            raise InputError(f"vision {self.name}: observer and target are both on {self.target.vehicle}")
+        return self
+
+    @property
+    def calibration(self) -> Calibration:
+        return Calibration(time_s=self.time_sigma_s, mounting_rad=math.radians(self.mounting_sigma_deg))
 
 
 class LinkTable(Table):
@@ -565,6 +850,7 @@ class Flight(Table):
     flight: FlightInfo = FlightInfo()
     vehicle: tuple[VehicleTable, ...] = Field(min_length=1)
     range: tuple[Ranges, ...] = ()
+    vision: tuple[Vision, ...] = ()
     link: tuple[LinkTable, ...] = ()
     pair: tuple[LinkTable, ...] = ()
     settings: Annotated[dict[str, Any], PlainValidator(_check_settings)] = Field(default_factory=dict)

@@ -25,10 +25,14 @@ from scenarios.flights.nmea import NmeaPositions, read_nmea
 from scenarios.flights.rtklib_pos import PosFile, read_pos
 from scenarios.flights.schema import STANDARD_GRAVITY, axes_matrix
 from scenarios.flights.tables import RawTable, Times, ordered, read_columns, read_times, time_columns
+from scenarios.flights.time_tag import tagged_times
+from scenarios.flights.ubx import read_ubx_fixes
 
 G = 9.8
 MAX_DISTANCE_M = 1e6  # of position fixes from the local origin
 DEFAULT_SIGMA_M = (3.0, 3.0, 6.0)  # of position fixes that state none
+DEFAULT_SIGMA_MPS = (0.1, 0.1, 0.2)  # of their velocities
+MIN_SIGMA = 1e-4
 MAX_RATE_RPS = 40.0  # no gyroscope of a vehicle measures more (2300 deg/s)
 MAX_FORCE = 100.0  # times the median
 SAME_S = 1e-3  # two logs of one ranging exchange agree to this
@@ -83,18 +87,18 @@ def read_raw(
     day: str = "",
 ) -> Raw:
     """Read a file of any kind; columns matter for "csv" and "mat" only. Raises InputError as its readers do."""
-    if kind == "rtklib-pos":
-        pos = read_pos(path)
+    if kind in ("rtklib-pos", "ubx"):
+        pos = read_pos(path) if kind == "rtklib-pos" else read_ubx_fixes(path)
         return Raw(pos.times, pos=pos)
     if kind == "nmea":
         nmea = read_nmea(path, day)
         return Raw(nmea.times, nmea=nmea)
     time_numbers, time_texts = time_columns(time)
     table = read_columns(path, options, kind, [*time_numbers, *columns], [*time_texts, *texts])
-    return Raw(read_times(table, time), table)
+    return Raw(tagged_times(table, options, time) if time.tag and kind == "csv" else read_times(table, time), table)
 
 
-def _the_table(raw: Raw) -> RawTable:
+def the_table(raw: Raw) -> RawTable:
     assert raw.table is not None
     return raw.table
 
@@ -103,16 +107,16 @@ def _the_table(raw: Raw) -> RawTable:
 
 
 def read_imu(path: Path, imu: schema.Imu) -> Raw:
-    return read_raw(path, imu, imu.format, imu.time, (*imu.accel, *imu.gyro))
+    return read_raw(path, imu, imu.format, imu.time, imu.columns)
 
 
 def imu_stream(raw: Raw, imu: schema.Imu, place: Place) -> tuple[ImuStream, ReadReport]:
     """Specific force and rate in the body frame. Raises InputError for wrong units and axes, as far as gravity tells."""
-    table = _the_table(raw)
+    table = the_table(raw)
     source = str(table.path)
-    f = table.stack(imu.accel) * (STANDARD_GRAVITY if imu.accel_unit == "g" else 1.0)
-    w = table.stack(imu.gyro) * (np.pi / 180 if imu.gyro_unit == "deg/s" else 1.0)
+    f = _forces(table, imu)
     t = raw.times.since(place.t0)
+    w = _rates(table, imu, t)
     keep, dropped = ordered(t, np.hstack([f, w]), source)
     wild = keep & _wild(f, w, keep)
     keep &= ~wild
@@ -122,8 +126,23 @@ def imu_stream(raw: Raw, imu: schema.Imu, place: Place) -> tuple[ImuStream, Read
         raise InputError(f"{source}: {int(keep.sum())} usable row; an IMU needs two at least")
     C_bs = imu.C_bs
     stream = ImuStream(t[keep], f[keep] @ C_bs.T, w[keep] @ C_bs.T, imu.is_mean)
-    notes = _check_gravity(stream, f[keep], w[keep], imu, source)
+    notes = () if imu.accel == "level" else _check_gravity(stream, f[keep], w[keep], imu, source)
     return stream, ReadReport(source, len(stream.t_s), {**table.dropped, **dropped}, notes)
+
+
+def _forces(table: RawTable, imu: schema.Imu) -> Array:
+    """Specific forces (n, 3) along the columns' axes; those of a level vehicle without acceleration where none are measured."""
+    if imu.accel == "level":
+        return np.tile(STANDARD_GRAVITY * imu.C_bs[2], (table.n_rows_kept, 1))
+    return table.stack(imu.accel) * (STANDARD_GRAVITY if imu.accel_unit == "g" else 1.0)
+
+
+def _rates(table: RawTable, imu: schema.Imu, t_s: Array) -> Array:
+    """Angular rates (n, 3) along the columns' axes; a single column is the rate about the body's up axis."""
+    w = table.stack(imu.gyro_columns) * (np.pi / 180 if imu.gyro_unit == "deg/s" else 1.0)
+    if imu.gyro_increments:
+        w = w / np.diff(t_s, prepend=np.nan)[:, None]
+    return w if w.shape[1] == 3 else w * imu.C_bs[2]
 
 
 def _wild(f: Array, w: Array, among: BoolArray) -> BoolArray:
@@ -153,10 +172,7 @@ def _check_gravity(stream: ImuStream, f_s: Array, w_s: Array, imu: schema.Imu, s
     up = float(mean[2] / np.linalg.norm(mean))
     if up < -0.5:
         likely = _likely_axes(f_s.mean(axis=0), imu)
-        raise InputError(f"{source}: gravity says the vehicle is upside down with axes {imu.axes}{likely}")
-    if up < 0.7:
-        likely = _likely_axes(f_s.mean(axis=0), imu)
-        notes.append(f"the body's up axis carries {up:.0%} of gravity with axes {imu.axes}{likely}")
+        raise InputError(f"{source}: gravity says (along D, not U) the vehicle is upside down with axes {imu.axes}{likely}")
     return tuple(notes)
 
 
@@ -198,15 +214,22 @@ def _likely_axes(f_s: Array, imu: schema.Imu) -> str:
 
 
 def read_positions(path: Path, p: schema.Positions) -> Raw:
-    return read_raw(path, p, p.format, p.time, (*p.position, *(p.sigma or ())), day=p.date)
+    columns = (*p.position, *(p.sigma or ()), *(p.velocity or ()), *(() if p.quality is None else (p.quality,)))
+    return read_raw(path, p, p.format, p.time, columns, day=p.date)
 
 
-def position_stream(raw: Raw, p: schema.Positions, lever_b: Vec3, place: Place, path: Path) -> tuple[PositionStream, ReadReport]:
-    """Position fixes in n with their standard deviations per axis of n."""
+def position_streams(
+    raw: Raw, p: schema.Positions, lever_b: Vec3, place: Place, path: Path
+) -> tuple[tuple[PositionStream, ...], ReadReport]:
+    """Position fixes in n with their standard deviations per axis of n, and their velocities where the file has them.
+
+    Velocities that hold at another time than the positions are a stream of their own, without positions.
+    """
     r_n, dropped = _positions_n(raw, p.frame, p.position, place)
-    sigma = _position_sigma(raw, p, place, len(r_n))
+    sigma = _position_sigma(raw, p, place, len(r_n)) * p.sigma_scale
     t = raw.times.since(place.t0)
     keep, more = ordered(t, np.hstack([r_n, sigma]), str(path))
+    keep = _of_quality(raw, p, keep, more, path)
     distance_m = np.linalg.norm(r_n, axis=1)
     far = keep & (distance_m > MAX_DISTANCE_M)
     if far.sum() > 0.5 * keep.sum():
@@ -217,8 +240,61 @@ def position_stream(raw: Raw, p: schema.Positions, lever_b: Vec3, place: Place, 
     keep &= ~far
     if far.any():
         more[f"farther than {MAX_DISTANCE_M / 1e3:g} km from the local origin"] = int(far.sum())
-    stream = PositionStream(t[keep], r_n[keep], np.maximum(sigma[keep], 1e-4), lever_b, p.name)
-    return stream, ReadReport(str(path), len(stream.t_s), {**dropped, **more})
+    sigma = np.maximum(sigma[keep], MIN_SIGMA)
+    report = ReadReport(str(path), int(keep.sum()), {**dropped, **more})
+    velocity = _velocity(raw, p, place) if p.use_velocity else None
+    if velocity is None:
+        return (PositionStream(t[keep], r_n[keep], sigma, lever_b, p.name),), report
+    v_n, sigma_mps = velocity[0][keep], np.maximum(velocity[1][keep] * p.sigma_scale, MIN_SIGMA)
+    if p.velocity_offset_s == 0:
+        return (PositionStream(t[keep], r_n[keep], sigma, lever_b, p.name, v_n, sigma_mps),), report
+    fixes = PositionStream(t[keep], r_n[keep], sigma, lever_b, p.name)
+    none = np.full_like(v_n, np.nan)
+    velocities = PositionStream(t[keep] + p.velocity_offset_s, none, none, lever_b, p.name, v_n, sigma_mps)
+    return (fixes, velocities), report
+
+
+def _of_quality(
+    raw: Raw, p: schema.Positions | schema.TruthTable, keep: BoolArray, dropped: dict[str, int], path: Path
+) -> BoolArray:
+    """The kept rows (n,) that are of a wanted kind of fix; the others are counted in `dropped`."""
+    if not p.qualities:
+        return keep
+    if raw.pos is not None:
+        quality = raw.pos.quality
+    elif raw.table is not None and p.quality is not None:
+        quality = np.nan_to_num(raw.table.numbers[p.quality], nan=-1.0).astype(np.int64)
+    else:
+        raise InputError(f"{path}: qualities needs the column of the kind of fix; give quality")
+    wanted = np.isin(quality, p.qualities)
+    if not (keep & wanted).any():
+        found = ", ".join(map(str, np.unique(quality[keep]).tolist()))
+        raise InputError(f"{path}: no row is of the wanted qualities {', '.join(map(str, p.qualities))}; there are {found}")
+    if (n := int((keep & ~wanted).sum())) > 0:
+        dropped["of another kind of fix"] = n
+    return keep & wanted
+
+
+def _velocity(raw: Raw, p: schema.Positions, place: Place) -> tuple[Array, Array] | None:
+    """Velocities (n, 3) of fixes in n and their standard deviations (n, 3); None where the file has none."""
+    if raw.pos is not None:
+        v_n, cov = raw.pos.velocity_enu(place.frame.C_en)
+        if not np.isfinite(v_n).any():
+            return None
+        sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+        sigma = np.where(sigma > 0, sigma, DEFAULT_SIGMA_MPS)
+    elif raw.table is not None and p.velocity is not None:
+        cells = raw.table.stack(p.velocity)
+        v_n = cells if p.frame == "llh" else _velocity_n(cells, p.frame, place)
+        sigma = np.tile(DEFAULT_SIGMA_MPS, (len(v_n), 1))
+    else:
+        return None
+    return v_n, sigma if p.velocity_sigma_mps is None else np.tile(p.velocity_sigma_mps, (len(v_n), 1))
+
+
+def _velocity_n(cells: Array, frame: str, place: Place) -> Array:
+    """Velocities (n, 3) of a file's axes in n."""
+    return place.frame.rotate_from_ecef(cells) if frame == "ecef" else np.asarray(cells @ turn(frame, place).T)
 
 
 def _positions_n(raw: Raw, frame: str, columns: Sequence[str | int], place: Place) -> tuple[Array, dict[str, int]]:
@@ -229,7 +305,7 @@ def _positions_n(raw: Raw, frame: str, columns: Sequence[str | int], place: Plac
         return r_n, raw.pos.dropped
     if raw.nmea is not None:
         return place.frame.from_ecef(_ecef_of_llh(raw.nmea.llh_deg)), raw.nmea.dropped
-    table = _the_table(raw)
+    table = the_table(raw)
     cells = table.stack(columns)
     if cells.shape[1] == 2:
         cells = np.column_stack([cells, np.zeros(len(cells))])
@@ -238,11 +314,11 @@ def _positions_n(raw: Raw, frame: str, columns: Sequence[str | int], place: Plac
     elif frame == "ecef":
         r_n = place.frame.from_ecef(cells)
     else:
-        r_n = cells @ _turn(frame, place).T
+        r_n = cells @ turn(frame, place).T
     return r_n, table.dropped
 
 
-def _turn(frame: str, place: Place) -> Array:
+def turn(frame: str, place: Place) -> Array:
     """Rotation (3, 3) from the axes of a local or north-east-down file to n."""
     return place.C_nl @ ENU_NED if frame == "ned" else place.C_nl
 
@@ -264,14 +340,14 @@ def read_heights(path: Path, h: schema.Heights) -> Raw:
 
 def height_stream(raw: Raw, h: schema.Heights, lever_b: Vec3, place: Place) -> tuple[HeightStream, ReadReport]:
     """Heights above the local origin; cells outside [valid_min, valid_max] are counted."""
-    table = _the_table(raw)
+    table = the_table(raw)
     cells = table.numbers[h.height]
     up = h.scale * cells + h.offset_m - (place.frame.h_m if h.ellipsoidal else 0.0)
     t = raw.times.since(place.t0)
     keep, dropped = ordered(t, up[:, None], str(table.path))
     outside = keep & ~((cells >= h.valid_min) & (cells <= h.valid_max))
     keep &= ~outside
-    thin = _thinned(t, keep, h.min_interval_s)
+    thin = thinned(t, keep, h.min_interval_s)
     counts = {"outside valid_min and valid_max": int(outside.sum()), "thinned by min_interval_s": int(keep.sum() - thin.sum())}
     if not thin.any():
         raise InputError(f"{table.path}: no height lies between valid_min {h.valid_min:g} and valid_max {h.valid_max:g}")
@@ -280,7 +356,7 @@ def height_stream(raw: Raw, h: schema.Heights, lever_b: Vec3, place: Place) -> t
     return stream, ReadReport(str(table.path), len(stream.t_s), {**table.dropped, **dropped})
 
 
-def _thinned(t: Array, keep: BoolArray, interval_s: float) -> BoolArray:
+def thinned(t: Array, keep: BoolArray, interval_s: float) -> BoolArray:
     """The first kept row of every interval."""
     if interval_s <= 0:
         return keep
@@ -300,6 +376,7 @@ def constant_heights(h: schema.Heights, lever_b: Vec3, start_s: float, end_s: fl
 
 def read_truth(path: Path, truth: schema.TruthTable) -> Raw:
     columns = (*truth.position, *(truth.velocity or ()), *(truth.quaternion or ()))
+    columns += () if truth.quality is None else (truth.quality,)
     return read_raw(path, truth, truth.format, truth.time, columns, day=truth.date)
 
 
@@ -308,19 +385,23 @@ def truth_of(
 ) -> tuple[Truth, ReadReport]:
     """Reference trajectory of the IMU.
 
-    C_ba (3, 3): from the vehicle's declared axes to the body; lever_b (3,): from the declared origin to the IMU.
+    C_ba (3, 3): from the vehicle's declared axes to the body; lever_b (3,): from the point of the trajectory to the IMU.
+    Without attitude the vertical part of the lever arm is applied, as to a level vehicle.
     """
     r_n, dropped = _positions_n(raw, truth.frame, truth.position, place)
     t = raw.times.since(place.t0)
     C_nb, v_n = _truth_attitude(raw, truth, C_ba, place), _truth_velocity(raw, truth, place)
     keep, more = ordered(t, np.hstack([r_n, *(x.reshape(len(t), -1) for x in (C_nb, v_n) if x is not None)]), str(path))
+    keep = _of_quality(raw, truth, keep, more, path)
     notes: tuple[str, ...] = ()
     if np.any(lever_b):
         if C_nb is None:
-            notes = ("truth has no attitude, so it is not moved from its origin to the IMU",)
+            r_n = r_n + lever_b * [0.0, 0.0, 1.0]
+            if np.any(lever_b[:2]):
+                notes = ("truth has no attitude, so it is moved to the IMU in height only",)
         else:
             r_n = r_n + C_nb @ lever_b
-        if v_n is not None:
+        if v_n is not None and (C_nb is not None or np.any(lever_b[:2])):
             v_n, notes = None, (*notes, "the true velocity is left out: it belongs to another point than the IMU")
     q_nb = None if C_nb is None else quat_from_matrix(C_nb[keep])
     result = Truth(t[keep], r_n[keep], None if v_n is None else v_n[keep], q_nb)
@@ -348,16 +429,13 @@ def _truth_attitude(raw: Raw, truth: schema.TruthTable, C_ba: Array, place: Plac
     if wrong > 0.5 * len(q):
         raise InputError(f"{raw.table.path}: {wrong} of {len(q)} quaternions are not of unit length; check truth.quaternion")
     C = matrix_from_quat(np.where(fits, q, np.nan) / np.where(fits, norm, 1.0))
-    return np.asarray(_turn(truth.frame, place) @ C @ C_ba.T)
+    return np.asarray(turn(truth.frame, place) @ C @ C_ba.T)
 
 
 def _truth_velocity(raw: Raw, truth: schema.TruthTable, place: Place) -> Array | None:
     if truth.velocity is None or raw.table is None:
         return None
-    v = raw.table.stack(truth.velocity)
-    if truth.frame == "ecef":
-        return place.frame.rotate_from_ecef(v)
-    return np.asarray(v @ _turn(truth.frame, place).T)
+    return _velocity_n(raw.table.stack(truth.velocity), truth.frame, place)
 
 
 # ranges
@@ -390,7 +468,7 @@ def range_stream(
     unknown: set[str] = set()
     rows = _RangeRows()
     for raw in raws:
-        table = _the_table(raw)
+        table = the_table(raw)
         rows.t.append(raw.times.since(place.t0))
         rows.r.append(ranges.scale * table.numbers[ranges.range] + ranges.offset_m)
         rows.sigma.append(np.full(table.n_rows_kept, ranges.sigma_m) if ranges.sigma is None else table.numbers[ranges.sigma])
@@ -398,7 +476,7 @@ def range_stream(
         rows.b.append(_tag_index(table.texts[ranges.tag_b], index, unknown))
     t, r, sigma = (np.concatenate(column) for column in (rows.t, rows.r, rows.sigma))
     a, b = np.concatenate(rows.a), np.concatenate(rows.b)
-    source = ", ".join(str(_the_table(raw).path) for raw in raws)
+    source = ", ".join(str(the_table(raw).path) for raw in raws)
     finite = np.isfinite(t) & np.isfinite(r) & np.isfinite(sigma) & (sigma > 0)
     declared = (a >= 0) & (b >= 0) & (a != b)
     usable = finite & declared & (r > 0)
@@ -415,7 +493,7 @@ def range_stream(
     again = _logged_twice(t[order], r[order], np.sort(np.column_stack([a[order], b[order]]), axis=1))
     kept = order[~again]
     counts["logged twice"] = int(again.sum())
-    dropped = {reason: n for raw in raws for reason, n in _the_table(raw).dropped.items()}
+    dropped = {reason: n for raw in raws for reason, n in the_table(raw).dropped.items()}
     dropped |= {reason: n for reason, n in counts.items() if n}
     stream = RangeStream(t[kept], a[kept], b[kept], tags, r[kept], sigma[kept], ranges.name)
     return stream, ReadReport(source, len(kept), dropped)

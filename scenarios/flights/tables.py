@@ -82,6 +82,8 @@ def require_file(path: Path) -> Path:
         return path
     if path.is_dir():
         raise InputError(f"{path}: is a folder, a file is needed")
+    if path.is_symlink():
+        raise InputError(f"{path}: a link to {path.readlink()}, which is not there")
     if not path.parent.is_dir():
         raise InputError(f"{path}: no such file; its folder does not exist")
     near = difflib.get_close_matches(path.name, [p.name for p in path.parent.iterdir()], n=1)
@@ -177,6 +179,9 @@ def _plain_text(data: bytes, options: TextOptions) -> tuple[bytes, str, int]:
     if options.comment:
         mark = options.comment.encode()
         data = b"\n".join(line for line in data.split(b"\n") if not line.lstrip().startswith(mark))
+    if options.only:
+        mark = options.only.encode()
+        data = b"\n".join(line for line in data.split(b"\n") if line.startswith(mark))
     if options.delimiter != "whitespace":
         return data, options.delimiter, options.skip_rows + 1
     return re.sub(rb"(?m)^ +| +$", b"", re.sub(rb"[ \t\r]+", b" ", data)), " ", options.skip_rows + 1

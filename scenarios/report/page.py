@@ -172,12 +172,19 @@ def _error_section(found: Sequence[ErrorSeries], limit: int) -> Section:
 
 def _table_sections(solution: Solution) -> list[Section]:
     diagnostics, table = solution.diagnostics, solution.residuals
+    timeline = quality.outlier_timeline(table, POINT_LIMIT // 2)
     arcs = tables.ambiguities(solution.ambiguities) if solution.ambiguities.link else ""
     constants = tables.parameters(diagnostics.parameters) if diagnostics.parameters else ""
     about = f'<div class="pair">{tables.timings(diagnostics.runtime_s)}{tables.versions(solution.versions)}</div>'
     return [
         Section("ambiguities", "Ambiguities", "Ambiguities", html=arcs, absent="No ambiguities were estimated."),
-        Section("outliers", "Outliers", "Outliers", html=tables.outliers(table) if len(table.t_s) else ""),
+        Section(
+            "outliers",
+            "Outliers",
+            "Outliers",
+            [timeline] if timeline else [],
+            tables.outliers(table) if len(table.t_s) else "",
+        ),
         Section("parameters", "Estimated parameters", "Parameters", html=constants),
         Section(
             "configuration",

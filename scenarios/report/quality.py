@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import norm
 
 from factorgraph.consistency import judge
+from factorgraph.models.outliers import GROSS, MULTIPATH, NLOS, SLIP, WORDS
 from factorgraph.solution import Diagnostics, ResidualTable
 from factorgraph.types import Array, IntArray
 from scenarios.metrics import ErrorSeries, cdf
@@ -37,6 +38,9 @@ from scenarios.report.series import (
     thin,
     thin_note,
 )
+
+TIMELINE_LABELS = 48
+CLASS_COLOURS = {GROSS: TRUTH_COLOUR, MULTIPATH: CYCLE[4], NLOS: ALERT_COLOUR, SLIP: CYCLE[3]}
 
 
 def residuals(table: ResidualTable, outlier_sigma: float | None, limit: int) -> list[Chart]:
@@ -72,6 +76,41 @@ def _drawn_note(good: int, all_good: int, strange: int, all_strange: int) -> str
     parts = [f"{good:,} of {all_good:,} residuals in use, chosen at random"] if good < all_good else []
     parts += [f"the largest {strange:,} of {all_strange:,} outliers"] if strange < all_strange else []
     return f"Drawn: {', '.join(parts)}." if parts else ""
+
+
+def outlier_timeline(table: ResidualTable, limit: int) -> Chart | None:
+    """When which satellite, radio or axis had outliers, by what they look like; None without any.
+
+    The labels with most outliers are drawn, at most TIMELINE_LABELS.
+    """
+    flagged = np.flatnonzero(table.outlier_class > 0)
+    if not len(flagged):
+        return None
+    count = np.bincount(table.label_index[flagged], minlength=len(table.label))
+    drawn = np.argsort(-count, kind="stable")[: min(TIMELINE_LABELS, int(np.sum(count > 0)))]
+    names = [plot_text(table.label[i]) for i in sorted(drawn.tolist(), key=lambda i: table.label[i])]
+    rows = flagged[np.isin(table.label_index[flagged], drawn)]
+    data: list[Trace] = []
+    shown = 0
+    for i, words in WORDS.items():
+        mine = rows[table.outlier_class[rows] == i]
+        if len(mine):
+            kept = sample(limit, mine)
+            shown += len(kept)
+            marker = {"color": CLASS_COLOURS[i], "size": 7, "symbol": "line-ns-open" if i == GROSS else "square", "opacity": 0.8}
+            kinds = [f"{plot_text(table.kind[table.kind_index[k]])} {table.residual[k]:+.3g}" for k in kept]
+            cloud: Trace = {"type": "scatter", "mode": "markers", "name": words, "marker": marker, "text": kinds}
+            cloud |= {"x": seconds(table.t_s[kept]), "y": [plot_text(table.label[k]) for k in table.label_index[kept]]}
+            data.append(cloud | {"hovertemplate": f"%{{y}} %{{text}} at %{{x:.2f}} s<extra>{words}</extra>"})
+    axis = {"type": "category", "categoryorder": "array", "categoryarray": names[::-1], "dtick": 1}
+    parts = [f"{shown:,} of {len(rows):,} outliers"] if shown < len(rows) else []
+    more = int(np.sum(count > 0)) - len(names)
+    parts += [f"the {len(names)} labels with most outliers; {more} more have some"] if more else []
+    note = f"Drawn: {', '.join(parts)}." if parts else ""
+    chart = time_chart("Outliers by satellite, radio or axis", [Panel("", data, axis, max(1.0, len(names) / 8))], note)
+    chart.layout.update({"hovermode": "closest"})
+    del chart.layout["hoversubplots"]
+    return chart
 
 
 def histogram(table: ResidualTable) -> Chart | None:

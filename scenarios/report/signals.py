@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from factorgraph.models.outliers import GROSS, WORDS
 from factorgraph.solution import Fix, PairSolution, ResidualTable
 from factorgraph.types import Array
 from scenarios.metrics import pair_name
@@ -18,6 +19,7 @@ from scenarios.report.chart import (
     log_axis,
     time_chart,
 )
+from scenarios.report.quality import CLASS_COLOURS
 from scenarios.report.series import (
     ALERT_COLOUR,
     AXIS_COLOURS,
@@ -40,6 +42,7 @@ SYSTEM_COLOURS = dict(zip(SYSTEM_NAMES, CYCLE, strict=False))
 FIX_AXIS = {"range": [0, 1], "fixedrange": True, "showticklabels": False, "showgrid": False, "zeroline": False}
 SKY_ROWS = 60_000  # residuals the paths are taken from
 SKY_POINTS = 60  # a satellite
+SKY_MARKS = 400  # a class of outliers
 
 
 def fixing(pair: PairSolution, threshold: float | None, limit: int) -> Chart:
@@ -109,7 +112,32 @@ def skyplot(table: ResidualTable) -> Chart | None:
         path = mine[np.linspace(0, len(mine) - 1, min(SKY_POINTS, len(mine))).astype(np.int64)]
         name = table.label[table.label_index[mine[0]]]
         tracks.append((name, np.rad2deg(table.azimuth_rad[path]), np.rad2deg(table.elevation_rad[path])))
-    return sky_chart("Sky", tracks)
+    chart = sky_chart("Sky", tracks)
+    marks = _sky_marks(table)
+    return replace(chart, data=legend_once([*chart.data, *marks])) if marks else chart
+
+
+def _sky_marks(table: ResidualTable) -> list[Trace]:
+    """Where outliers were that last: reflections and suspected slips."""
+    marks: list[Trace] = []
+    for i, words in WORDS.items():
+        rows = sample(SKY_MARKS, np.flatnonzero((table.outlier_class == i) & np.isfinite(table.azimuth_rad)))
+        if i == GROSS or not len(rows):
+            continue
+        marks.append(
+            {
+                "type": "scatterpolar",
+                "mode": "markers",
+                "name": words,
+                "legendgroup": words,
+                "theta": numbers(np.rad2deg(table.azimuth_rad[rows]), 5),
+                "r": numbers(np.rad2deg(table.elevation_rad[rows]), 5),
+                "marker": {"color": CLASS_COLOURS[i], "size": 6, "symbol": "x", "opacity": 0.7},
+                "text": [plot_text(table.label[k]) for k in table.label_index[rows]],
+                "hovertemplate": f"%{{text}}: {words}<br>azimuth %{{theta:.1f}}°, elevation %{{r:.1f}}°<extra></extra>",
+            }
+        )
+    return marks
 
 
 def sky_chart(title: str, tracks: Sequence[tuple[str, Array, Array]], note: str = "") -> Chart:

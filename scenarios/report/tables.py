@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from factorgraph.models.outliers import GROSS, class_counts
+from factorgraph.models.outliers import outlier_runs as runs_of
 from factorgraph.solution import AmbiguityTable, ParameterEstimate, ResidualTable, Solution
 from scenarios.metrics import ErrorSeries, SummaryRow, statistics, summary_rows
 from scenarios.report.chart import UNITS
@@ -15,6 +17,7 @@ from scenarios.report.series import normalised
 
 ROW_LIMIT = 400
 OUTLIER_LIMIT = 200
+RUN_LIMIT = 100
 
 
 def text(value: object) -> str:
@@ -109,7 +112,24 @@ def outliers(found: ResidualTable) -> str:
         values = [f"{found.t_s[i]:.2f}", number(found.residual[i]), UNITS.get(kind, "SI"), number(found.sigma[i], 3)]
         rows.append([*names, *values, number(scaled[i], 3), number(found.weight[i], 2)])
     shown = f"The largest {OUTLIER_LIMIT} of {len(flagged):,}" if len(flagged) > OUTLIER_LIMIT else f"All {len(flagged):,}"
-    return paragraph(f"{shown} outliers among {len(found.t_s):,} residuals.") + table(head, rows, 3)
+    singles = paragraph(f"{shown} outliers among {len(found.t_s):,} residuals.") + table(head, rows, 3)
+    return outlier_runs(found) + folded("Show the outliers one by one", singles)
+
+
+def outlier_runs(found: ResidualTable) -> str:
+    """Outliers that belong together, the largest effects first."""
+    runs = runs_of(found)
+    rows = []
+    for run in runs[:RUN_LIMIT]:
+        unit = UNITS.get(run.kind, "SI")
+        sign = "" if run.outlier_class == GROSS else "+"
+        span = [f"{run.start_s:.1f}", f"{run.end_s:.1f}", f"{run.n:,}"]
+        rows.append([run.kind, run.source, run.label, run.words, *span, f"{run.mean:{sign}.3g}", number(run.largest, 3), unit])
+    head = ("kind", "source", "label", "looks like", "from [s]", "to [s]", "rows", "mean", "largest", "unit")
+    counts = ", ".join(f"{n:,} {words}" for words, n in class_counts(found).items())
+    more = f" The {RUN_LIMIT} with the largest effect of {len(runs):,} runs." if len(runs) > RUN_LIMIT else ""
+    note = "Gross errors are single rows; of them the mean size. In differences a negative sign means the reference's."
+    return paragraph(f"By what they look like: {counts}.{more} {note}") + table(head, rows, 4)
 
 
 def parameters(found: Sequence[ParameterEstimate]) -> str:

@@ -10,13 +10,14 @@ from factorgraph.measurements import ImuStream
 from factorgraph.problem import ImuNoise, Link, MotionPrior, NavigationProblem, Vehicle
 from scenarios.flights.navigation import Navigation, builtin_constellation
 from scenarios.flights.schema import Flight
-from scenarios.simulate import fixes, gnss, imu, ranging, trajectory
+from scenarios.simulate import fixes, gnss, imu, motion_sensors, ranging, trajectory
 from scenarios.simulate.gnss import GnssRecord, Sky
 from scenarios.simulate.imu import ImuRecord
+from scenarios.simulate.motion_sensors import SensorRecord
 from scenarios.simulate.ranging import RangeRecord
 from scenarios.simulate.scenario import Scenario, VehicleTable
 from scenarios.simulate.streams import Streams
-from scenarios.simulate.trajectory import Trajectory
+from scenarios.simulate.trajectory import Carried, Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +28,7 @@ class Record:
     imu: dict[str, ImuRecord]
     gnss: dict[str, GnssRecord]
     ranges: tuple[RangeRecord, ...]  # in the order of the problem's ranges
+    sensors: dict[str, SensorRecord]  # "car/odometer"; of visions by their name
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,12 +70,18 @@ def simulate(scenario: Scenario, seed: int, known: Exact | None = None) -> Simul
     streams = Streams(seed)
     known = known or exact(scenario, seed)
     sky = _sky(scenario, streams)
-    record = Record(known.trajectories, {}, {}, ())
+    record = Record(known.trajectories, {}, {}, (), {})
     vehicles = tuple(_vehicle(v, scenario, sky, streams / v.name, known, record) for v in scenario.vehicle)
     ranges = [
         ranging.simulate(table, known.trajectories, info.duration_s, streams / f"range {table.name}", info.noise_scale)
         for table in scenario.range
     ]
+    visions = []
+    for sight in scenario.vision:
+        stream, record.sensors[sight.name] = motion_sensors.vision(
+            sight, known.trajectories, info.duration_s, streams / f"vision {sight.name}", info.noise_scale
+        )
+        visions.append(stream)
     problem = NavigationProblem(
         name=info.name,
         t0=info.t0,
@@ -81,6 +89,7 @@ def simulate(scenario: Scenario, seed: int, known: Exact | None = None) -> Simul
         vehicles=vehicles,
         links=tuple(Link(k.reference, k.rover) for k in scenario.link),
         ranges=tuple(model for model, _ in ranges),
+        visions=tuple(visions),
         pairs=tuple(Link(k.reference, k.rover) for k in scenario.pair),
         settings=Flight.model_construct(settings=scenario.settings).problem_settings,
     )
@@ -104,6 +113,14 @@ def _vehicle(table: VehicleTable, scenario: Scenario, sky: Sky, streams: Streams
         imu_stream, record.imu[table.name] = imu.simulate(table.imu, known.imu[table.name], streams / "imu", scale)
     if table.gnss is not None:
         antenna, record.gnss[table.name] = gnss.simulate(table.gnss, sky, path, streams / "gnss", scale)
+    moving = (
+        [motion_sensors.velocities(s, path, duration, streams / s.name, scale) for s in table.velocities],
+        [motion_sensors.attitudes(s, path, duration, streams / s.name, scale) for s in table.attitudes],
+        [motion_sensors.magnetics(s, path, duration, streams / s.name, scale) for s in table.magnetometers],
+    )
+    record.sensors.update({f"{table.name}/{s.name}": errors for sensors in moving for s, errors in sensors})
+    if isinstance(table.trajectory, Carried):
+        return Vehicle(table.name, gnss=antenna, carrier=table.trajectory.carrier)
     return Vehicle(
         name=table.name,
         imu=imu_stream,
@@ -111,6 +128,10 @@ def _vehicle(table: VehicleTable, scenario: Scenario, sky: Sky, streams: Streams
         gnss=antenna,
         positions=tuple(fixes.positions(p, path, duration, streams / p.name, scale) for p in table.positions),
         heights=tuple(fixes.heights(h, path, duration, streams / h.name, scale) for h in table.heights),
+        velocities=tuple(s for s, _ in moving[0]),
+        attitudes=tuple(s for s, _ in moving[1]),
+        magnetics=tuple(s for s, _ in moving[2]),
+        constraints=table.constraints.constraints(table.constraints.axle_b),
         motion=table.motion.prior if table.motion else MotionPrior(),
         fixed_n=_fixed(table, path),
         truth=trajectory.truth(path, fixes.epochs(info.truth_hz, 0.0, duration)),

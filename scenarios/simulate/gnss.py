@@ -7,16 +7,18 @@ time tau, rho is the range from the antenna at t to the satellite at t - tau, tu
     Phi  = rho + c dt_u - c dt_s + T - I + noise + lambda N          (in cycles: Phi / lambda)
     -lambda D = d rho / dt (1 - ddt_u) + c ddt_u - c ddt_s + noise
 
-T and I are the models that estimators use, times the factors of the environment; errors of broadcast orbits and clocks
-are common to all receivers. Standard deviations grow with 1 / sin(el) as `factorgraph.problem.GnssNoise` says. N is an
-integer, new whenever tracking starts again, and jumps at a cycle slip. Outliers of single codes come at any time; faults of
-several codes at once in windows of time, also into observations that are there already (`with_code_faults`).
+T and I are the models that estimators use, times the factors of the environment, and disturbances (`simulate.atmosphere`);
+these and errors of broadcast orbits and clocks are common to all receivers. Standard deviations grow with 1 / sin(el) as
+`factorgraph.problem.GnssNoise` says. N is an integer, new whenever tracking starts again, and jumps at a cycle slip. Outliers
+of single codes come at any time; faults of several codes at once in windows of time, also into observations that are there
+already (`with_code_faults`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
@@ -33,6 +35,7 @@ from factorgraph.types import Array, BoolArray, IntArray
 from scenarios.flights.navigation import Navigation
 from scenarios.flights.schema import GnssNoiseTable, Table
 from scenarios.flights.signals import MEGAHERTZ, wavelength_m
+from scenarios.simulate.atmosphere import Rays, ionosphere_m, wet_m
 from scenarios.simulate.fixes import epochs
 from scenarios.simulate.streams import Streams, gauss_markov
 from scenarios.simulate.trajectory import Trajectory
@@ -75,6 +78,8 @@ class ClockTable(Table):
     offset_s: float = Field(default=3e-4, ge=0, le=0.01)  # drawn evenly between plus and minus this
     drift: float = Field(default=1e-7, ge=0)  # standard deviation, seconds per second
     drift_walk_rts: float = Field(default=3e-10, ge=0)  # density, per sqrt(s)
+    limit_s: float = Field(default=0.0, ge=0)  # an offset beyond it is set back by whole milliseconds; 0: never
+    phase_follows: bool = True  # phases jump with the clock, as codes do
 
 
 class GnssTable(Table):
@@ -93,7 +98,9 @@ class GnssTable(Table):
     outlier_m: tuple[PositiveFloat, PositiveFloat] = (5.0, 50.0)  # smallest and largest size, either sign
     slips_per_hour: float = Field(default=0.0, ge=0)  # of every satellite
     slip_cycles: PositiveInt = 20  # largest
+    slip_half_probability: float = Probability  # that a slip is half a cycle more
     lli_probability: float = Field(default=1.0, ge=0, le=1)  # that the receiver flags a slip
+    half_cycle_s: float = Field(default=0.0, ge=0)  # from lock on, phases are flagged as ambiguous by half a cycle, and may be
     outages: tuple[Outage, ...] = ()
     code_faults: tuple[CodeFaults, ...] = ()
 
@@ -103,6 +110,10 @@ class EnvironmentTable(Table):
 
     troposphere: float = Field(default=1.0, ge=0)  # times the model's delay
     ionosphere: float = Field(default=1.0, ge=0)  # times the broadcast model's delay; 0: none is broadcast either
+    troposphere_mapping: Literal["sine", "niell"] = "sine"  # of the model's delay
+    wet_m: float = Field(default=0.0, ge=0)  # wet delay of the zenith over the model's, standard deviation at sea level
+    ionosphere_waves_m: float = Field(default=0.0, ge=0)  # travelling disturbances, vertical at L1, standard deviation
+    ionosphere_gradient_ppm: float = Field(default=0.0, ge=0)  # of the vertical delay at L1, in a random direction
     satellite_error_m: float = Field(default=0.0, ge=0)  # broadcast orbits and clocks, standard deviation of a range
     satellite_error_s: PositiveFloat = 1800.0
     sky_s: float = Field(default=0.0, ge=0)  # the constellation has moved on for so long since its nominal sky
@@ -115,7 +126,7 @@ class Slip:
     t_s: float
     satellite: str
     signal: str
-    cycles: int
+    cycles: float
     flagged: bool
 
 
@@ -124,12 +135,18 @@ class GnssRecord:
     """What was put in, row by row of the stream."""
 
     integer: IntArray  # (n,) N
+    half: IntArray  # (n,) half cycles beside it
     outlier_m: Array  # (n,) 0 where there is none
     range_m: Array  # (n,) rho
     elevation_rad: Array  # (n,)
     slips: tuple[Slip, ...]
     clock_s: Array  # (m,) receiver clock offset per epoch
     clock_drift: Array  # (m,)
+
+    @property
+    def cycles(self) -> Array:
+        """What the phase holds beside ranges and clocks (n,)."""
+        return self.integer + 0.5 * self.half
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +169,18 @@ class Sky:
             unit = gauss_markov(_white(self.streams(name), len(nodes)), ERROR_NODE_S / self.environment.satellite_error_s)
             error[rows] = np.interp(t_s[rows], nodes, unit)
         return error * self.environment.satellite_error_m
+
+    def disturbances_m(self, rays: Rays) -> tuple[Array, Array]:
+        """Slant ionosphere at L1 and slant wet delay (n,) beyond the models, the same fields for every receiver."""
+        own, e = self.streams / "atmosphere", self.environment
+        lat, lon, _ = geodesy.geodetic_from_ecef(self.frame.origin_ecef[None])
+        origin = (float(lat[0]), float(lon[0]))
+        iono, wet = np.zeros(len(rays.t_s)), np.zeros(len(rays.t_s))
+        if e.ionosphere_waves_m > 0 or e.ionosphere_gradient_ppm > 0:
+            iono = ionosphere_m(rays, e.ionosphere_waves_m, e.ionosphere_gradient_ppm, own("ionosphere"), origin)
+        if e.wet_m > 0:
+            wet = wet_m(rays, e.wet_m, own("wet"), origin)
+        return iono, wet
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,15 +217,15 @@ def simulate(
     check_signals(table.signals)
     table = table.model_copy(update={"signals": tuple(sorted(set(table.signals)))})
     t_tag = epochs(table.rate_hz, table.offset_s, sky.duration_s)
-    clock_s, drift = _clock(table.clock, t_tag, streams("clock"))
+    clock_s, drift, reset_s = _clock(table.clock, t_tag, streams("clock"))
     t = t_tag - clock_s
     r_n, v_n = trajectory.at(t).point(table.lever_b)
     r = sky.frame.to_ecef(r_n)
     names = _in_view(table, sky, t, r)
-    geometry = _geometry(sky, names, t, r, sky.frame.rotate_to_ecef(v_n))
+    geometry = _geometry(sky, names, t, r, sky.frame.rotate_to_ecef(v_n), noise_scale)
     tracked = (geometry.el >= np.deg2rad(table.mask_deg)) & (geometry.record >= 0) & ~_outages(table.outages, names, t)
     rows = _rows(table, names, tracked, streams)
-    integer, lli, slips = _integers(table, names, tracked, t_tag, streams)
+    integer, half, lli, slips = _integers(table, names, tracked, t_tag, streams)
     e, s, k = rows.epoch, rows.sat, rows.signal
     lam = np.array([[wavelength_m(j, sky.navigation.glonass_channels.get(i)) for j in table.signals] for i in names])[s, k]
     el = geometry.el[e, s]
@@ -219,10 +248,10 @@ def simulate(
         signals=tuple(table.signals[j] for j in used_signals),
         wavelength_m=lam,
         code_m=common + iono + noise.code_m + outlier,
-        phase_cyc=(common - iono + noise.phase_m) / lam + integer[e, s, k],
+        phase_cyc=(common - iono + noise.phase_m - C_MPS * reset_s[e]) / lam + integer[e, s, k] + 0.5 * half[e, s, k],
         doppler_hz=-(rate + noise.rate_mps) / lam,
         cn0_dbhz=34.0 + 16.0 * np.sin(el) + noise_scale * 0.7 * rows.drawn("cn0", _white),
-        lli=lli[e, s],
+        lli=lli[e, s, k],
         sat_pos_ecef=geometry.pos[e, s],
         sat_vel_ecef=geometry.vel[e, s],
         sat_clock_m=sat_clock,
@@ -230,7 +259,7 @@ def simulate(
         approx_ecef=np.round(r[0], 4),
         klobuchar=sky.navigation.klobuchar,
     )
-    record = GnssRecord(integer[e, s, k], outlier, geometry.rho[e, s], el, slips, clock_s, drift)
+    record = GnssRecord(integer[e, s, k], half[e, s, k], outlier, geometry.rho[e, s], el, slips, clock_s, drift)
     antenna = Antenna(stream, table.lever_b, told(table))
     return with_code_faults(antenna, record, table.code_faults, streams, noise_scale)
 
@@ -324,12 +353,21 @@ def told(table: GnssTable) -> GnssNoise:
     return replace(noise, code_m=float(np.hypot(noise.code_m, table.multipath_m)))
 
 
-def _clock(table: ClockTable, t_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+def _clock(table: ClockTable, t_s: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Offset and drift (m,), and the part of the offset (m,) that phases do not show."""
     start, rate, steps = rng.uniform(-1, 1), rng.normal(), rng.normal(0.0, 1.0, len(t_s))
     dt = np.diff(t_s, prepend=t_s[0])
     drift = table.drift * rate + np.cumsum(table.drift_walk_rts * np.sqrt(dt) * steps)
     mean = 0.5 * (drift + np.concatenate([drift[:1], drift[:-1]]))
-    return table.offset_s * start + np.cumsum(mean * dt), drift
+    offset = table.offset_s * start + np.cumsum(mean * dt)
+    if not table.limit_s:
+        return offset, drift, np.zeros(len(t_s))
+    reset, total = np.zeros(len(t_s)), 0.0
+    for k, free in enumerate(offset):
+        if abs(free + total) > table.limit_s:
+            total -= 1e-3 * np.ceil((abs(free + total) - table.limit_s) / 1e-3) * np.sign(free + total)
+        reset[k] = total
+    return offset + reset, drift, np.zeros(len(t_s)) if table.phase_follows else reset
 
 
 def _outliers(table: GnssTable, rng: np.random.Generator, n: int) -> Array:
@@ -369,7 +407,7 @@ def _angles(sat_ecef: Array, r_ecef: Array) -> tuple[Array, Array]:
     return look_angles(np.einsum("nij,nj->ni", geodesy.C_en(lat, lon), los))
 
 
-def _geometry(sky: Sky, names: tuple[str, ...], t_s: Array, r: Array, v: Array) -> _Geometry:
+def _geometry(sky: Sky, names: tuple[str, ...], t_s: Array, r: Array, v: Array, noise_scale: float) -> _Geometry:
     m, S = len(t_s), len(names)
     epoch, sat = np.repeat(np.arange(m), S), np.tile(np.arange(S), m)
     states, travel = sky.navigation.states_seen_from(names, sat, sky.t0, t_s[epoch], r[epoch])
@@ -382,11 +420,14 @@ def _geometry(sky: Sky, names: tuple[str, ...], t_s: Array, r: Array, v: Array) 
     rho_dot = closing / (1 + np.einsum("ni,ni->n", e, sat_vel - turning) / C_MPS)
     lat, lon, h = (x[epoch] for x in geodesy.geodetic_from_ecef(r))
     az, el = look_angles(np.einsum("nij,nj->ni", geodesy.C_en(lat, lon), e))
-    tropo = sky.environment.troposphere * atmosphere.troposphere_m(lat, h, el)
+    day = sky.t0.day_of_year if sky.environment.troposphere_mapping == "niell" else None
+    tropo = sky.environment.troposphere * atmosphere.troposphere_m(lat, h, el, day_of_year=day)
     iono = np.zeros(m * S)
     klobuchar = sky.navigation.klobuchar
     if klobuchar is not None:
         iono = sky.environment.ionosphere * atmosphere.klobuchar_m(klobuchar, sky.t0.sow + t_s[epoch], lat, lon, az, el)
+    more_iono, more_tropo = sky.disturbances_m(Rays(t_s[epoch], lat, lon, h, az, el))
+    iono, tropo = iono + noise_scale * more_iono, tropo + noise_scale * more_tropo
     return _Geometry(
         pos=states.pos_ecef.reshape(m, S, 3),
         vel=states.vel_ecef.reshape(m, S, 3),
@@ -410,13 +451,14 @@ def _turned(x: Array, travel_s: Array) -> tuple[Array, Array]:
 
 def _integers(
     table: GnssTable, names: tuple[str, ...], tracked: BoolArray, t_tag: Array, streams: Streams
-) -> tuple[IntArray, IntArray, tuple[Slip, ...]]:
-    """Integers (m, S, K), loss-of-lock flags (m, S) and the list of slips."""
+) -> tuple[IntArray, IntArray, IntArray, tuple[Slip, ...]]:
+    """Integers and half cycles (m, S, K), flags (m, S, K) of lost lock and half cycles, and the list of slips."""
     m = len(tracked)
     begins = tracked & ~np.vstack([np.zeros((1, len(names)), bool), tracked[:-1]])
     arc = np.cumsum(begins, axis=0) - 1
-    lli = (begins & (np.arange(m) > 0)[:, None]).astype(np.int64)
-    integer = np.zeros((*tracked.shape, len(table.signals)), np.int64)
+    shape = (*tracked.shape, len(table.signals))
+    lli = np.repeat((begins & (np.arange(m) > 0)[:, None]).astype(np.int64)[:, :, None], shape[2], axis=2)
+    integer, half = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
     slips = []
     for i, name in enumerate(names):
         own = streams / f"integers/{name}"
@@ -430,5 +472,19 @@ def _integers(
             start = rng.integers(-INTEGER_RANGE, INTEGER_RANGE + 1, m)
             jump = rng.integers(1, table.slip_cycles + 1, m) * rng.choice([-1, 1], m)
             integer[:, i, j] = start[np.maximum(arc[:, i], 0)] + np.cumsum(np.where(slipped, jump, 0))
-            slips += [Slip(float(t_tag[n]), name, signal, int(jump[n]), bool(flagged[n])) for n in np.flatnonzero(slipped)]
-    return integer, lli, tuple(sorted(slips, key=lambda slip: (slip.t_s, slip.satellite, slip.signal)))
+            more = own(f"half slips/{signal}").random(m) < table.slip_half_probability
+            half[:, i, j] = np.cumsum(slipped & more)
+            open_, off = _unresolved(begins[:, i] | (slipped & flagged), table.half_cycle_s, t_tag, own(f"half/{signal}"))
+            half[:, i, j] += off
+            lli[open_, i, j] |= 2
+            slips += [
+                Slip(float(t_tag[n]), name, signal, jump[n] + 0.5 * more[n], bool(flagged[n])) for n in np.flatnonzero(slipped)
+            ]
+    return integer, half, lli, tuple(sorted(slips, key=lambda slip: (slip.t_s, slip.satellite, slip.signal)))
+
+
+def _unresolved(locked: BoolArray, duration_s: float, t_s: Array, rng: np.random.Generator) -> tuple[BoolArray, IntArray]:
+    """When half cycles are open (m,) since an epoch of `locked`, and half cycles (m,) the phase is then off by."""
+    last = np.maximum.accumulate(np.where(locked, np.arange(len(t_s)), -1))
+    is_open = (last >= 0) & (t_s - t_s[np.maximum(last, 0)] < duration_s)
+    return is_open, np.where(is_open, rng.integers(0, 2, len(t_s))[np.maximum(last, 0)], 0)

@@ -2,8 +2,10 @@
 
     [scenario]     name, summary, t0, origin, duration_s, noise_scale
     [environment]  troposphere, ionosphere, errors of broadcast orbits and clocks
-    [[vehicle]]    name, trajectory, imu, gnss, positions, heights, motion, is_base
+    [[vehicle]]    name, trajectory, imu, gnss, positions, heights, velocities, attitudes, magnetometers, constraints,
+                   motion, is_base
     [[range]]      a set of ranges between tags
+    [[vision]]     a camera or radar on a vehicle that follows a point of another
     [[link]]       a pair whose GNSS observations are differenced
     [[pair]]       a pair whose relative solution is wanted
     [settings]     the fields of `factorgraph.problem.Settings`
@@ -21,13 +23,14 @@ from pydantic import Field, PositiveFloat, ValidationError, model_validator
 
 from factorgraph.errors import InputError
 from factorgraph.gpstime import GpsTime
-from scenarios.flights.schema import T0, LinkTable, Motion, Origin, Table, _message, dotted, nearest_hint
+from scenarios.flights.schema import T0, ConstraintsTable, LinkTable, Motion, Origin, Table, _message, dotted, nearest_hint
 from scenarios.simulate.fixes import HeightTable, PositionTable
 from scenarios.simulate.gnss import EnvironmentTable, GnssTable
 from scenarios.simulate.imu import ImuTable
+from scenarios.simulate.motion_sensors import AttitudeTable, MagnetometerTable, VelocityTable, VisionTable
 from scenarios.simulate.ranging import RangeTable
 from scenarios.simulate.streams import Name
-from scenarios.simulate.trajectory import Static, TrajectoryTable
+from scenarios.simulate.trajectory import Carried, Static, TrajectoryTable
 
 FOLDER = Path(__file__).resolve().parent.parent / "data" / "scenarios"
 
@@ -59,14 +62,25 @@ class VehicleTable(Table):
     gnss: GnssTable | None = None
     positions: tuple[PositionTable, ...] = ()
     heights: tuple[HeightTable, ...] = ()
+    velocities: tuple[VelocityTable, ...] = ()
+    attitudes: tuple[AttitudeTable, ...] = ()
+    magnetometers: tuple[MagnetometerTable, ...] = ()
+    constraints: ConstraintsTable = ConstraintsTable()  # told to the estimator
     motion: Motion | None = None
     is_base: bool = False
     heading_hint: bool = False  # the estimator is told the true heading at the start
+
+    def sensors(self) -> list[PositionTable | HeightTable | VelocityTable | AttitudeTable | MagnetometerTable]:
+        """The named ones."""
+        return [*self.positions, *self.heights, *self.velocities, *self.attitudes, *self.magnetometers]
 
     @model_validator(mode="after")
     def _base_rests(self) -> VehicleTable:
         if self.is_base and not (isinstance(self.trajectory, Static) and self.imu is None and self.gnss is not None):
             raise InputError(f"vehicle {self.name}: a base has a static trajectory, a receiver and no IMU")
+        more = self.imu is not None or self.positions or self.heights or self.motion is not None or self.heading_hint
+        if isinstance(self.trajectory, Carried) and (self.gnss is None or more):
+            raise InputError(f"vehicle {self.name}: a carried antenna has gnss and nothing else")
         return self
 
 
@@ -77,6 +91,7 @@ class Scenario(Table):
     environment: EnvironmentTable = EnvironmentTable()
     vehicle: tuple[VehicleTable, ...] = Field(min_length=1)
     range: tuple[RangeTable, ...] = ()
+    vision: tuple[VisionTable, ...] = ()
     link: tuple[LinkTable, ...] = ()
     pair: tuple[LinkTable, ...] = ()
     settings: dict[str, Any] = Field(default_factory=dict)
@@ -84,7 +99,8 @@ class Scenario(Table):
     @model_validator(mode="after")
     def _distinct(self) -> Scenario:
         names = {"vehicles": [v.name for v in self.vehicle], "range sets": [r.name for r in self.range]}
-        names |= {f"sensors of {v.name}": [p.name for p in v.positions] + [h.name for h in v.heights] for v in self.vehicle}
+        names["visions"] = [s.name for s in self.vision]
+        names |= {f"sensors of {v.name}": [s.name for s in v.sensors()] for v in self.vehicle}
         for what, given in names.items():
             doubled = sorted({name for name in given if given.count(name) > 1})
             if doubled:

@@ -114,6 +114,24 @@ class Static(Table):
     heading_deg: float = 0.0
 
 
+class Hover(Table):
+    """A multicopter that wanders about a place, its rotors' thrust along its up axis, pointing where it likes."""
+
+    kind: Literal["hover"]
+    r_n: Vec3 = (0.0, 0.0, 0.0)
+    heading_deg: float = 0.0
+    turn_deg: float = Field(default=0.0, ge=0)  # wandering of the heading, rms
+    sway_m: float = Field(default=1.0, gt=0)
+    sway_s: PositiveFloat = 15.0
+
+
+class Carried(Table):
+    """No motion of its own: a further antenna of a vehicle."""
+
+    kind: Literal["carried"]
+    carrier: str
+
+
 class Rates(Table):
     """Acceleration along the front axis and rates of the Euler angles; what is not given stays as it is."""
 
@@ -138,7 +156,8 @@ class Kinematic(Table):
     segments: tuple[Rates, ...] = Field(min_length=1)
 
 
-TrajectoryTable = Annotated[Waypoints | Manoeuvres | Formation | Static | Kinematic, Field(discriminator="kind")]
+AnyTable = Waypoints | Manoeuvres | Formation | Static | Hover | Carried | Kinematic
+TrajectoryTable = Annotated[AnyTable, Field(discriminator="kind")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,29 +265,38 @@ def build(
     done: dict[str, Trajectory] = {}
     left = dict(tables)
     while left:
-        ready = [name for name, table in left.items() if not isinstance(table, Formation) or table.leader in done]
+        ready = [name for name, table in left.items() if (needed := _needed(table)) is None or needed in done]
         for name in ready:
             table = left.pop(name)
-            if isinstance(table, Kinematic):
+            if isinstance(table, Carried):
+                done[name] = done[table.carrier]
+            elif isinstance(table, Kinematic):
                 done[name] = _kinematic(name, table, duration_s, frame)
             else:
                 done[name] = _splined(name, table, nodes, duration_s, rngs[name], done)
         if not ready:
-            name, table = next((n, t) for n, t in left.items() if isinstance(t, Formation))
-            reason = "follows itself in a circle" if table.leader in tables else f"there are {', '.join(tables)}"
-            raise InputError(f"vehicle {name}: cannot follow {table.leader}: {reason}")
+            name, needed = next((n, _needed(t)) for n, t in left.items())
+            reason = "follows itself in a circle" if needed in tables else f"there are {', '.join(tables)}"
+            raise InputError(f"vehicle {name}: cannot follow {needed}: {reason}")
     return {name: done[name] for name in tables}
+
+
+def _needed(table: TrajectoryTable) -> str | None:
+    """The vehicle whose trajectory another follows from."""
+    return table.leader if isinstance(table, Formation) else table.carrier if isinstance(table, Carried) else None
 
 
 def _splined(
     name: str,
-    table: Waypoints | Manoeuvres | Formation | Static,
+    table: Waypoints | Manoeuvres | Formation | Static | Hover,
     nodes: Array,
     duration_s: float,
     rng: np.random.Generator,
     done: dict[str, Trajectory],
 ) -> SplineTrajectory:
     heading = None
+    if isinstance(table, Hover):
+        return _hovering(table, nodes, rng)
     if isinstance(table, Static):
         r, heading, follow = np.tile(table.r_n, (len(nodes), 1)), np.full(len(nodes), np.deg2rad(table.heading_deg)), "level"
     elif isinstance(table, Waypoints):
@@ -297,6 +325,17 @@ def _with_attitude(name: str, nodes: Array, r: Array, banks: bool, heading: Arra
     right = np.column_stack([np.cos(heading), -np.sin(heading)])
     pitch = np.arctan2(v[:, 2], np.hypot(np.hypot(v[:, 0], v[:, 1]), SLOW_MPS))
     roll = np.arctan2(np.sum(a[:, :2] * right, axis=1), STANDARD_GRAVITY + a[:, 2]) if banks else np.zeros(len(nodes))
+    return SplineTrajectory(position, make_interp_spline(nodes, np.column_stack([pitch, roll, heading]), k=5))
+
+
+def _hovering(table: Hover, nodes: Array, rng: np.random.Generator) -> SplineTrajectory:
+    position = make_interp_spline(nodes, table.r_n + _sway(table.sway_m, table.sway_s, nodes, rng), k=5)
+    turn = np.deg2rad(table.turn_deg) * np.sqrt(3 / 2) * _sway(1.0, 2 * table.sway_s, nodes, rng)[:, 0]
+    heading = np.deg2rad(table.heading_deg) + turn
+    f = position(nodes, 2) + [0.0, 0.0, STANDARD_GRAVITY]
+    right = f[:, 0] * np.cos(heading) - f[:, 1] * np.sin(heading)
+    front = f[:, 0] * np.sin(heading) + f[:, 1] * np.cos(heading)
+    pitch, roll = np.arctan2(-front, f[:, 2]), np.arctan2(right, np.hypot(front, f[:, 2]))
     return SplineTrajectory(position, make_interp_spline(nodes, np.column_stack([pitch, roll, heading]), k=5))
 
 

@@ -4,8 +4,8 @@
     NAME.obs, flight.nav    RINEX observations of each receiver and the navigation messages of all
     NAME-imu.csv            t_s, specific force [m/s^2], angular rate [rad/s]; right, front, up
     NAME-truth.csv          t_s, position, velocity, attitude quaternion (scalar first)
-    NAME-SENSOR.csv         position fixes and heights
-    SENSOR.csv              ranges: t_s, from_id, to_id, range, sigma
+    NAME-SENSOR.csv         position fixes, heights, velocities, attitudes, magnetic fields
+    SENSOR.csv              ranges: t_s, from_id, to_id, range, sigma; sights: t_s, azimuth, elevation, range [rad, m]
 
 Numbers come back to the last digit, except for observations and orbits, which RINEX rounds.
 """
@@ -19,19 +19,30 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.csv as pacsv
 
-from factorgraph.measurements import HeightStream, ImuStream, PositionStream, RangeStream, Truth
+from factorgraph.measurements import (
+    AttitudeStream,
+    HeightStream,
+    ImuStream,
+    MagneticStream,
+    PositionStream,
+    RangeStream,
+    Truth,
+    VelocityStream,
+)
 from factorgraph.problem import Vehicle
 from factorgraph.types import Array
 from scenarios.flights import schema
 from scenarios.flights.rinex_writer import write_navigation, write_observations
 from scenarios.simulate.flight import SimulatedFlight
 from scenarios.simulate.gnss import told
+from scenarios.simulate.motion_sensors import AttitudeTable, MagnetometerTable, VelocityTable
 from scenarios.simulate.scenario import VehicleTable
 
 NAVIGATION_FILE = "flight.nav"
 ACCEL, GYRO = ("f_right", "f_front", "f_up"), ("w_right", "w_front", "w_up")
 POSITION, VELOCITY = ("r_east", "r_north", "r_up"), ("v_east", "v_north", "v_up")
 QUATERNION = ("q_w", "q_x", "q_y", "q_z")
+VELOCITY_B, FIELD = ("v_right", "v_front", "v_up"), ("m_right", "m_front", "m_up")
 SIGMA = ("sigma_east", "sigma_north", "sigma_up")
 Columns = Mapping[str, Array | list[str]]
 
@@ -50,6 +61,7 @@ def write_flight(flight: SimulatedFlight, folder: Path) -> Path:
         flight=schema.FlightInfo(name=info.name, summary=info.summary, t0=info.t0, origin=info.origin),
         vehicle=vehicles,
         range=ranges,
+        vision=tuple(_vision(flight, k, folder) for k in range(len(flight.problem.visions))),
         link=flight.scenario.link,
         pair=flight.scenario.pair,
         settings=flight.scenario.settings,
@@ -68,10 +80,15 @@ def _vehicle(flight: SimulatedFlight, table: VehicleTable, folder: Path) -> sche
         gnss=_gnss(flight, v, table, folder),
         positions=tuple(_positions(v.name, p, folder) for p in v.positions),
         heights=tuple(_heights(v.name, h, folder) for h in v.heights),
+        velocities=tuple(_velocities(v.name, s, t, folder) for s, t in zip(v.velocities, table.velocities, strict=True)),
+        attitudes=tuple(_attitudes(v.name, s, t, folder) for s, t in zip(v.attitudes, table.attitudes, strict=True)),
+        magnetometers=tuple(_magnetics(v.name, s, t, folder) for s, t in zip(v.magnetics, table.magnetometers, strict=True)),
+        constraints=table.constraints,
         motion=table.motion,
         fixed=schema.Fixed(local_m=v.fixed_n) if v.fixed_n else None,
         truth=_truth(v.name, v.truth, folder) if v.truth else None,
         heading_hint_deg=_degrees(v.heading_hint_rad),
+        carrier=v.carrier,
     )
 
 
@@ -108,14 +125,95 @@ def _gnss(flight: SimulatedFlight, v: Vehicle, table: VehicleTable, folder: Path
 
 def _positions(name: str, stream: PositionStream, folder: Path) -> schema.Positions:
     columns = {"t_s": stream.t_s, **_named(POSITION, stream.r_n), **_named(SIGMA, stream.sigma_m)}
+    if stream.v_n is not None and stream.sigma_mps is not None:
+        columns |= _named(VELOCITY, stream.v_n)
+        sigma_v = tuple(stream.sigma_mps[0].tolist())
     file = _columns(folder / f"{name}-{stream.name}.csv", columns)
-    return schema.Positions(file=file, name=stream.name, time=TIME, position=POSITION, sigma=SIGMA, lever_b=stream.lever_b)
+    return schema.Positions(
+        file=file,
+        name=stream.name,
+        time=TIME,
+        position=POSITION,
+        sigma=SIGMA,
+        velocity=VELOCITY if stream.v_n is not None else None,
+        velocity_sigma_mps=sigma_v if stream.v_n is not None else None,
+        lever_b=stream.lever_b,
+    )
 
 
 def _heights(name: str, stream: HeightStream, folder: Path) -> schema.Heights:
     file = _columns(folder / f"{name}-{stream.name}.csv", {"t_s": stream.t_s, "up": stream.up_m})
-    sigma = float(stream.sigma_m[0])
-    return schema.Heights(file=file, name=stream.name, time=TIME, height="up", sigma_m=sigma, lever_b=stream.lever_b)
+    return schema.Heights(
+        file=file,
+        name=stream.name,
+        time=TIME,
+        height="up",
+        sigma_m=float(stream.sigma_m[0]),
+        lever_b=stream.lever_b,
+        bias_sigma_m=stream.calibration.bias,
+        bias_walk_m_rts=stream.calibration.bias_walk,
+    )
+
+
+def _velocities(name: str, stream: VelocityStream, table: VelocityTable, folder: Path) -> schema.Velocities:
+    forward = table.axes == "forward"
+    columns = {"t_s": stream.t_s, **({"v_front": stream.v_b[:, 1]} if forward else _named(VELOCITY_B, stream.v_b))}
+    return schema.Velocities(
+        file=_columns(folder / f"{name}-{stream.name}.csv", columns),
+        name=stream.name,
+        time=TIME,
+        forward="v_front" if forward else None,
+        velocity=None if forward else VELOCITY_B,
+        sigma_mps=table.sigma_mps,
+        lever_b=stream.lever_b,
+        scale_sigma=table.scale_sigma,
+        mounting_sigma_deg=table.mounting_sigma_deg,
+    )
+
+
+def _attitudes(name: str, stream: AttitudeStream, table: AttitudeTable, folder: Path) -> schema.Attitudes:
+    return schema.Attitudes(
+        file=_columns(folder / f"{name}-{stream.name}.csv", {"t_s": stream.t_s, **_named(QUATERNION, stream.q_nb)}),
+        name=stream.name,
+        time=TIME,
+        quaternion=QUATERNION,
+        sigma_deg=table.sigma_deg,
+        tells=table.tells,
+        mounting_sigma_deg=table.mounting_sigma_deg,
+    )
+
+
+def _magnetics(name: str, stream: MagneticStream, table: MagnetometerTable, folder: Path) -> schema.Magnetometers:
+    return schema.Magnetometers(
+        file=_columns(folder / f"{name}-{stream.name}.csv", {"t_s": stream.t_s, **_named(FIELD, stream.m_b)}),
+        name=stream.name,
+        time=TIME,
+        field=FIELD,
+        field_m=table.field_n,
+        sigma=table.sigma,
+        bias_sigma=table.bias_sigma,
+        mounting_sigma_deg=table.mounting_sigma_deg,
+    )
+
+
+def _vision(flight: SimulatedFlight, index: int, folder: Path) -> schema.Vision:
+    table, stream = flight.scenario.vision[index], flight.problem.visions[index]
+    angles = {"azimuth": stream.azimuth_rad, "elevation": stream.elevation_rad} if table.angles else {}
+    columns = {"t_s": stream.t_s, **angles, **({"range": stream.range_m} if table.ranges else {})}
+    return schema.Vision(
+        name=table.name,
+        file=_columns(folder / f"{table.name}.csv", columns),
+        time=TIME,
+        observer=table.observer,
+        target=table.target,
+        azimuth="azimuth" if table.angles else None,
+        elevation="elevation" if table.angles else None,
+        range="range" if table.ranges else None,
+        unit="rad",
+        sigma_deg=table.sigma_deg,
+        sigma_m=table.sigma_m,
+        mounting_sigma_deg=table.mounting_sigma_deg,
+    )
 
 
 def _truth(name: str, truth: Truth, folder: Path) -> schema.TruthTable:

@@ -10,14 +10,13 @@ Source: Wu et al. (2022).
 from __future__ import annotations
 
 import argparse
-import difflib
 import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 
@@ -33,9 +32,8 @@ from factorgraph.types import Array, BoolArray
 from scenarios.published import aar
 from scenarios.published.aar import TANKER, UAV, AarData, AarFlight
 from scenarios.studies.aar_summary import DEFAULT, GRAPH, RATIO_THRESHOLD, SWEEP, JobKey, summarise
-from scenarios.studies.study import Arrays, Job, Outcome, Results, seeds
+from scenarios.studies.study import Arrays, Job, Outcome, Results, chosen, seeds
 
-T = TypeVar("T")
 REVISION = 2  # of what a job computes; results of another one are not used again
 SCHEMES = dict(zip("12345", Scheme, strict=True))
 FILTERS = tuple(number + letter for number in SCHEMES for letter in "ab")
@@ -106,10 +104,10 @@ class AarStudy:
         )  # fmt: skip
 
     def jobs(self, options: argparse.Namespace) -> Sequence[Job]:
-        data = _chosen("data set", options.data, aar.DATA_SETS)
-        algorithms = _chosen("algorithm", options.algorithms, (*FILTERS, GRAPH))
+        data = chosen("data set", options.data, aar.DATA_SETS)
+        algorithms = chosen("algorithm", options.algorithms, (*FILTERS, GRAPH))
         variants = options.variants or _usual_variants(algorithms, options.quick)
-        out = [job for name in _chosen("variant", variants, tuple(VARIANTS)) for job in _jobs(name, data, algorithms, options)]
+        out = [job for name in chosen("variant", variants, tuple(VARIANTS)) for job in _jobs(name, data, algorithms, options)]
         if not out:
             raise InputError("nothing to do: no variant is run with these data sets and algorithms")
         return out
@@ -160,16 +158,6 @@ def _usual_variants(algorithms: Sequence[str], is_quick: bool) -> list[str]:
     if not set(FILTERS) <= set(algorithms):
         return [DEFAULT]
     return [DEFAULT, SWEEP] if is_quick else list(VARIANTS)
-
-
-def _chosen(what: str, given: Sequence[T], known: Sequence[T]) -> list[T]:
-    """What is asked for, once each and in our order. Raises InputError with the nearest name for what there is not."""
-    for value in given:
-        if value not in known:
-            near = difflib.get_close_matches(str(value), [str(k) for k in known], n=1)
-            hint = f"; did you mean {near[0]}?" if near else ";"
-            raise InputError(f"no {what} {value}{hint} there are {', '.join(map(str, known))}")
-    return [value for value in known if value in given]
 
 
 def _jobs(name: str, data: Sequence[int], algorithms: Sequence[str], options: argparse.Namespace) -> Iterator[Job]:

@@ -16,6 +16,11 @@ STUDIES = Names(
             "scenarios.studies.aar:STUDY",
             "two-stage relative navigation for aerial refuelling, after Wu and others (2022)",
         ),
+        Named(
+            "stress",
+            "scenarios.studies.stress:STUDY",
+            "the factor graph under outliers, slips, wrong installations, unknown headings and long baselines",
+        ),
     ),
 )
 

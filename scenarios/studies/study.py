@@ -28,6 +28,7 @@ run with the same ones are used again, so what changes results (a revision of th
 from __future__ import annotations
 
 import argparse
+import difflib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,6 +36,7 @@ from typing import Any, Protocol, TypeVar
 
 from numpy.typing import NDArray
 
+from factorgraph.errors import InputError
 from scenarios.studies import store
 
 Arrays = Mapping[str, NDArray[Any]]  # name -> array of any type but object
@@ -104,3 +106,13 @@ def seeds(options: argparse.Namespace, usual: int, quick: int) -> range:
     """The seeds asked for: --trials of them, or `usual` or, with --quick, `quick`, from --seed on."""
     number = options.trials if options.trials is not None else quick if options.quick else usual
     return range(options.seed, options.seed + number)
+
+
+def chosen(what: str, given: Sequence[K], known: Sequence[K]) -> list[K]:
+    """What is asked for, once each and in our order. Raises InputError with the nearest name for what there is not."""
+    for value in given:
+        if value not in known:
+            near = difflib.get_close_matches(str(value), [str(k) for k in known], n=1)
+            hint = f"; did you mean {near[0]}?" if near else ";"
+            raise InputError(f"no {what} {value}{hint} there are {', '.join(map(str, known))}")
+    return [value for value in known if value in given]

@@ -152,7 +152,17 @@ def wrong_times(flight: SimulatedFlight, solution: Solution) -> set[int]:
                 key_a, key_b = (table.satellite[i], ref_signal, int(t)), (table.satellite[i], rover_signal, int(t))
                 inside = table.t_start_s[i] - 0.5 <= t <= table.t_end_s[i] + 0.5
                 if inside and key_a in number[pair.reference] and key_b in number[pair.rover]:
-                    deviations.add(int(table.integer[i]) - (number[pair.rover][key_b] - number[pair.reference][key_a]))
+                    true = number[pair.rover][key_b] - number[pair.reference][key_a]
+                    deviations.add(int(table.integer[i]) + _taken_off(solution, i, t) - true)
             if len(deviations) > 1:
                 wrong.add(int(t))
     return wrong
+
+
+def _taken_off(solution: Solution, arc: int, t_s: float) -> int:
+    """Cycles of the slips repaired in an arc up to a time."""
+    table, slips = solution.ambiguities, solution.slips
+    where = (table.link[arc], table.satellite[arc], table.signal[arc])
+    mine = [slip == where for slip in zip(slips.link, slips.satellite, slips.signal, strict=True)]
+    before = slips.repaired & (slips.t_s > table.t_start_s[arc]) & (slips.t_s < t_s + 0.5)
+    return round(float(np.sum(slips.cycles[before & np.array(mine, bool)])))

@@ -102,11 +102,24 @@ def test_loss_of_lock_while_the_other_receiver_was_silent_counts() -> None:
 
 
 def test_flags_that_are_no_loss() -> None:
-    """The half-cycle bit alone, and a loss at the first epoch of all, end nothing."""
+    """A loss at the first epoch of all ends nothing."""
     a, b = receivers(("G1C",))
-    a, b = flagged(a, at(a, "G03", "G1C", 12), bit=2), flagged(b, np.flatnonzero(b.epoch == 0))
+    b = flagged(b, np.flatnonzero(b.epoch == 0))
     arcs, _ = arcs_of(a, b)
     assert arcs.count == len(SATELLITES) and not found(arcs)
+
+
+@pytest.mark.parametrize("side", ["reference", "rover"])
+def test_phases_ambiguous_by_half_a_cycle_are_arcs_of_their_own(side: str) -> None:
+    """Only where the flag comes or goes."""
+    a, b = receivers(("G1C", "G2W"))
+    if side == "reference":
+        a = flagged(a, at(a, "G03", "G1C", slice(0, 12)), bit=2)
+    else:
+        b = flagged(b, at(b, "G03", "G1C", slice(0, 12)), bit=2)
+    arcs, pairs = arcs_of(a, b)
+    assert cuts(b, arcs, pairs) == {("G03", "G1C"): [12]} and found(arcs) == {"half-cycle flag": 1}
+    assert np.array_equal(np.flatnonzero(arcs.half), np.flatnonzero(np.isin(pairs.b, at(b, "G03", "G1C", slice(0, 12)))))
 
 
 @pytest.mark.parametrize(("missing", "begins"), [((9,), []), ((9, 10), [11]), ((9, 10, 11), [12])])
@@ -141,10 +154,11 @@ def test_without_doppler_there_is_no_such_test() -> None:
 
 @pytest.mark.parametrize("signals", [("G1C",), ("G1C", "G2W"), ("G1C", "G2W", "G5Q")])
 def test_a_jump_of_the_receiver_clock_is_no_slip(signals: tuple[str, ...]) -> None:
-    """A millisecond, in all codes and phases of one receiver."""
-    a, b = receivers(signals)
-    jump = np.where(b.epoch >= 15, 299_792.458, 0.0)
-    b = replace(b, code_m=b.code_m + jump, phase_cyc=b.phase_cyc + jump / b.wavelength_m)
+    """A millisecond, in all codes and phases of one receiver, which then observes so much earlier than its time tags say."""
+    a, _ = receivers(signals)
+    early = receiver(T - np.where(T >= 15, 1e-3, 0.0), every(EPOCHS, SATELLITES, signals), r_n=FAR_N, clock_m=120.0)
+    jump = np.where(early.epoch >= 15, 299_792.458, 0.0)
+    b = replace(early, t_s=T, code_m=early.code_m + jump, phase_cyc=early.phase_cyc + jump / early.wavelength_m)
     arcs, _ = arcs_of(a, b)
     assert arcs.count == len(SATELLITES) * len(signals) and not found(arcs)
 

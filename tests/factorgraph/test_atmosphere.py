@@ -50,3 +50,27 @@ def test_below_the_horizon_is_zero_and_absent_stays_absent() -> None:
     iono = atmosphere.klobuchar_m(KLOBUCHAR, np.zeros(2), 0.8, 0.1, np.zeros(2), el)
     assert tropo[0] == 0 and iono[0] == 0
     assert np.isnan(tropo[1]) and np.isnan(iono[1])
+
+
+def test_niells_mapping_is_rtklibs() -> None:
+    rtklib = pytest.importorskip("pyrtklib5")
+    rng = np.random.default_rng(4)
+    lat, _, h, _, el = directions(rng, 100)
+    el = np.maximum(el, np.deg2rad(3.0))
+    pos, azel, wet = rtklib.Arr1Ddouble(3), rtklib.Arr1Ddouble(2), rtklib.Arr1Ddouble(1)
+    for i in range(100):
+        time = rtklib.gpst2time(2300, rng.uniform(0, 604_800) + 604_800 * rng.integers(0, 52))
+        pos[0], pos[1], pos[2], azel[0], azel[1] = lat[i], 0.2, h[i], 0.3, el[i]
+        day = rtklib.time2doy(time)
+        assert atmosphere.niell_dry(lat[i], h[i], el[i], day) == pytest.approx(rtklib.tropmapf(time, pos, azel, wet), rel=1e-9)
+        assert atmosphere.niell_wet(lat[i], el[i]) == pytest.approx(wet[0], rel=1e-9)
+
+
+def test_mappings_agree_where_the_earth_is_flat() -> None:
+    el = np.deg2rad(np.array([90.0, 60.0, 30.0, 15.0, 5.0]))
+    plain, niell = (atmosphere.troposphere_m(0.8, 100.0, el, day_of_year=day) for day in (None, 150.0))
+    share = niell / plain
+    np.testing.assert_allclose(share[:2], 1.0, atol=1e-3)
+    assert np.all(np.diff(share) < 0) and 0.85 < share[-1] < 0.9
+    below = atmosphere.troposphere_m(0.8, 100.0, np.array([-0.1, np.nan]), day_of_year=150.0)
+    assert below[0] == 0 and np.isnan(below[1])

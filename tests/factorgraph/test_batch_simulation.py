@@ -98,21 +98,20 @@ def relative(solution: Solution, a: str, b: str) -> tuple[Array, Array]:
 
 
 def assert_integers_are_true(flight: SimulatedFlight, solution: Solution) -> None:
-    """Every fixed arc against the datum arc of its group, from the record's own integers."""
+    """Every fixed arc's first integer against that of the datum arc of its group, from the record's own integers."""
     table = solution.ambiguities
     found: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for i, state in enumerate(table.state):
         if state not in ("fixed", "datum"):
             continue
         link, signal = table.link[i], table.signal[i]
-        middle = 0.5 * (table.t_start_s[i] + table.t_end_s[i])
         true = 0
         for name, sign, own in zip(link.split("-"), (-1, 1), signal.split("/"), strict=True):
             antenna = flight.problem.vehicle(name).gnss
             assert antenna is not None
             s = antenna.stream
             mine = np.flatnonzero((s.sat == s.satellites.index(table.satellite[i])) & (s.signal == s.signals.index(own)))
-            at = mine[np.argmin(np.abs(s.t_s[s.epoch[mine]] - middle))]
+            at = mine[np.argmin(np.abs(s.t_s[s.epoch[mine]] - table.t_start_s[i]))]
             true += sign * int(flight.record.gnss[name].integer[at])
         found.setdefault((link, signal), []).append((table.integer[i], true))
     assert found
@@ -240,9 +239,10 @@ def test_roles_may_be_swapped(seed: int) -> None:
     np.testing.assert_array_equal(ab.t_s, ba.t_s)
     r, v = relative(one, "a", "b")
     r2, v2 = relative(other, "a", "b")
-    np.testing.assert_allclose(r2, r, atol=2e-5)
-    np.testing.assert_allclose(v2, v, atol=2e-5)
-    np.testing.assert_allclose(np.diagonal(ba.P, axis1=1, axis2=2), np.diagonal(ab.P, axis1=1, axis2=2), rtol=0.2)
+    # the prior of the first attitude is that of the alignment, which the start gives: a twentieth of a standard deviation
+    np.testing.assert_allclose(r2, r, atol=2e-4)
+    np.testing.assert_allclose(v2, v, atol=2e-4)
+    np.testing.assert_allclose(np.diagonal(ba.P, axis1=1, axis2=2), np.diagonal(ab.P, axis1=1, axis2=2), rtol=0.35)
     np.testing.assert_array_equal(ab.fix, ba.fix)
     # nothing absolute in the solution is no worse baseline: the start needs it all the same
     assert np.abs(r - true_baseline(flight, ab)[0]).max() < 0.04

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solveh_banded
 
-from factorgraph.graphs.covariance import JointCovariance
-from factorgraph.graphs.integers import tail_covariance
+from factorgraph.graphs.covariance import JointCovariance, covariance_of
 from factorgraph.graphs.optimizer import eliminate
 from factorgraph.graphs.variables import key
 from factorgraph.types import Array
@@ -155,13 +154,15 @@ def test_one_variable_alone() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_globals_eliminated_last_have_their_own_short_way(seed: int) -> None:
-    """The tail of the Bayes net is enough for the covariance of ambiguities, in any order."""
+@pytest.mark.parametrize("globals_last", [True, False])
+def test_a_few_variables_have_their_own_short_way(seed: int, globals_last: bool) -> None:
+    """Whatever the elimination, in any order of the keys, with or without a clique of their own."""
     info, scalars = random_chain(seed, n_globals=5)
-    net = info.eliminated(scalars)
-    keys = np.random.default_rng(seed).permutation(scalars)[:4].tolist()
-    np.testing.assert_allclose(tail_covariance(net, keys), info.inverse(keys), rtol=1e-8)
-    np.testing.assert_allclose(JointCovariance(net).joint(keys), info.inverse(keys), rtol=1e-8)
+    net = info.eliminated(scalars if globals_last else [])
+    rng = np.random.default_rng(seed)
+    keys = [*rng.permutation(scalars)[:4].tolist(), key("x", 0, 3), key("p", 1, 11)]
+    np.testing.assert_allclose(covariance_of(net, keys), info.inverse(keys), rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(covariance_of(net, keys[:1]), info.inverse(keys[:1]), rtol=1e-8)
 
 
 # -- long chains -----------------------------------------------------------------------------------

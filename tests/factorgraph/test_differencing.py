@@ -99,3 +99,13 @@ def test_nothing_is_a_case(shape: tuple[int, ...]) -> None:
     groups = CommonGroups.from_labels(np.zeros(0, np.int64))
     assert groups.project(np.zeros(shape), np.zeros(0)).shape == shape
     assert groups.mean(np.zeros(0), np.zeros(0)).shape == (0,)
+
+
+@given(st.integers(0, 10_000), st.lists(st.integers(1, 7), min_size=1, max_size=5))
+@settings(deadline=None, max_examples=50)
+def test_medians_are_those_of_active_rows(seed: int, sizes: list[int]) -> None:
+    rng = np.random.default_rng(seed)
+    label = np.repeat(np.arange(len(sizes)), sizes)
+    groups, y, active = CommonGroups.from_labels(label), rng.normal(size=sum(sizes)), rng.random(sum(sizes)) < 0.8
+    expected = [np.median(y[(label == g) & active]) if np.any(active & (label == g)) else 0.0 for g in range(len(sizes))]
+    np.testing.assert_allclose(groups.median(y, active), expected, rtol=1e-12)

@@ -95,7 +95,7 @@ def test_short_gaps_are_notes_and_long_ones_warnings() -> None:
     notes, warnings = gap_remarks(*flight(imu, np.arange(0.2, 10.0, 0.5)))
     assert warnings == ["one: no IMU samples from 6.00 to 8.00 s; attitude and motion in between are poorly known"]
     assert notes[0].startswith("one: no IMU samples from 2.50 to 2.90 s;")
-    assert notes[1].startswith("one: 5 ranges and heights")
+    assert notes[1].startswith("one: 5 measurements without IMU samples")
     assert len(notes) == 2
 
 

@@ -191,7 +191,7 @@ def test_one_range_per_state_is_singular() -> None:
 def test_weak_priors_make_it_regular() -> None:
     v = VehicleVariables(0, Vehicle("a", heights=(HeightStream(T, np.full(12, 5.0), np.full(12, 0.3)),)), T, FRAME)
     graph = graph_of(v, [*position_blocks(v, Parameters()), motion_block(v)])
-    add_priors(graph.native, v, 1.0)
+    add_priors(graph.native, v)
     graph.assemble()
     assert run(graph).status is Status.CONVERGED and graph.covariance_net() is not None
 

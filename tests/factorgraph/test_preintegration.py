@@ -9,13 +9,13 @@ from scipy.integrate import solve_ivp
 
 from factorgraph.attitude import log_so3, matrix_from_euler, skew
 from factorgraph.geodesy import LocalFrame
-from factorgraph.graphs.inertial import add_imu_factors
 from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.measurements import ImuStream
-from factorgraph.models.preintegration import PAIR_S, Increments, crossing, gaps, gtsam_inputs, integrate, sample_means
+from factorgraph.models.preintegration import PAIR_S, Increments, crossing, gaps, grouped_inputs, integrate, sample_means
 from factorgraph.models.strapdown import ideal_imu
 from factorgraph.problem import Vehicle
 from factorgraph.types import Array
+from tests.factorgraph.native_imu import add_imu_factors
 
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.3])
 
@@ -109,6 +109,30 @@ def test_intervals_of_one_call_are_those_of_single_calls() -> None:
             )
 
 
+def test_without_jacobians_the_increments_are_the_same() -> None:
+    imu = rough_imu(6)
+    start, stop = np.array([0.1, 0.1, 0.3031]), np.array([0.2503, 0.9, 0.7])
+    bias = np.tile(BIAS, (3, 1))
+    full, bare = integrate(imu, start, stop, bias), integrate(imu, start, stop, bias, jacobians=False)
+    for name in ("dt_s", "dR", "dv", "dp", "w_b"):
+        np.testing.assert_array_equal(getattr(full, name), getattr(bare, name))
+    assert not len(bare.dR_dbg)
+
+
+def test_samples_far_from_an_interval_do_not_matter() -> None:
+    """Nor do they where a gap near it is filled from what is around."""
+    imu = rough_imu(10, n=2000)
+    keep = np.ones(2000, bool)
+    keep[1000:1050] = False
+    whole = ImuStream(imu.t_s[keep], imu.f_b[keep], imu.w_b[keep], True)
+    near = slice(900, 1200)
+    part = ImuStream(whole.t_s[near], whole.f_b[near], whole.w_b[near], True)
+    for start, stop in ((4.9, 5.3), (5.0, 5.1), (5.26, 5.9)):
+        a, b = over(whole, start, stop), over(part, start, stop)
+        for name in Increments.__dataclass_fields__:
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
 def test_an_empty_interval_is_no_motion() -> None:
     inc = over(rough_imu(7), 0.3031, 0.3031)
     np.testing.assert_array_equal(inc.dR[0], np.eye(3))
@@ -176,7 +200,7 @@ def test_a_gap_is_known_and_filled_with_what_is_around_it() -> None:
 def test_gtsam_reproduces_the_increments_at_the_edges(start: float, stop: float) -> None:
     """Rotation, velocity and position to rounding, from steps of tens of milliseconds."""
     imu = rough_imu(9)
-    groups = gtsam_inputs(imu, np.array([start]), np.array([stop]), BIAS[None])
+    groups = grouped_inputs(imu, np.array([start]), np.array([stop]), BIAS[None])
     assert np.all(groups.dt_s <= PAIR_S / 2 + 1e-9) and abs(groups.dt_s.sum() - (stop - start)) < 1e-12
     params = gtsam.PreintegrationCombinedParams(np.array([0.0, 0.0, -9.8]))
     params.setGyroscopeCovariance(1e-6 * np.eye(3))

@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorgraph.filters import adaptive, kalman
-from factorgraph.models.robust import bifactor, cost, igg3, weight
+from factorgraph.models.robust import Mixture, RelaxedTls, bifactor, cost, igg3, mixture, weight
 from factorgraph.problem import Kernel, Robust
 from factorgraph.types import Array
 
-KERNELS = [k for k in get_args(Kernel)]
+KERNELS = [k for k in get_args(Kernel) if k != "self-tuned"]
+MIXTURES = [Mixture(), Mixture(0.3, 1.4, 6.0), Mixture(1e-3, 1.0, 50.0)]
 T = np.concatenate([-np.geomspace(50, 1e-3, 60), np.geomspace(1e-3, 50, 60)])
 
 
@@ -55,6 +56,8 @@ def test_even_bounded_and_never_rising(kernel: Kernel) -> None:
         ("geman-mcclure", 0.04, 8 / 5),
         ("tukey", 0.0, 4 / 6),
         ("none", 1.0, 8.0),
+        ("dcs", 0.16, 4 * (48 - 4) / (2 * 20)),
+        ("tls", 0.0, 2.0),
     ],
 )
 def test_values_at_twice_the_width(kernel: Kernel, w: float, rho: float) -> None:
@@ -69,7 +72,63 @@ def test_no_kernel_is_least_squares() -> None:
     np.testing.assert_array_equal(cost(None, T), 0.5 * T**2)
 
 
-@pytest.mark.parametrize("kernel", ["cauchy", "geman-mcclure", "tukey"])
+@pytest.mark.parametrize("loss", [*MIXTURES, *(RelaxedTls(2.0, mu) for mu in (0.01, 0.5, 20.0))])
+def test_weights_of_tuned_and_relaxed_losses_are_slopes(loss: Mixture | RelaxedTls) -> None:
+    t = T
+    if isinstance(loss, RelaxedTls):
+        bends = 2.0 * np.sqrt([loss.control / (loss.control + 1), (loss.control + 1) / loss.control])
+        t = T[np.min(np.abs(np.abs(T)[:, None] - bends), axis=1) > 2e-3]
+    h = 1e-5 * np.maximum(np.abs(t), 0.01)
+    slope = (cost(loss, t + h) - cost(loss, t - h)) / (2 * h)
+    np.testing.assert_allclose(weight(loss, t), slope / t, rtol=2e-4, atol=1e-7)
+    w = weight(loss, np.linspace(0, 100, 5001))
+    assert np.all((w >= 0) & (w <= 1)) and np.all(np.diff(w) <= 1e-15)
+    assert np.all(np.diff(cost(loss, np.linspace(0, 100, 5001))) >= -1e-12)
+
+
+def test_a_switch_variable_settles_at_what_dcs_weighs() -> None:
+    """Agarwal et al. (2013): s = min(1, 2 phi / (phi + t^2)) on the residual, so s^2 on its square."""
+    t = np.linspace(0.0, 30.0, 301)
+    phi = 2.5**2
+    np.testing.assert_allclose(weight(Robust("dcs", 2.5), t), np.minimum(1, 2 * phi / (phi + t**2)) ** 2, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("loss", "relaxed_loss"), [(Robust("tls", 2.0), RelaxedTls(2.0, 1e6))])
+def test_a_relaxed_loss_ends_as_itself(loss: Robust, relaxed_loss: RelaxedTls) -> None:
+    t = T[np.abs(np.abs(T) - 2.0) > 1e-3]
+    np.testing.assert_allclose(weight(relaxed_loss, t), weight(loss, t), atol=1e-12)
+    np.testing.assert_allclose(cost(relaxed_loss, t), cost(loss, t), atol=1e-5)
+
+
+@pytest.mark.parametrize(("share", "outer"), [(0.1, 12.0), (0.3, 6.0), (0.02, 30.0)])
+def test_a_mixture_finds_what_was_drawn(share: float, outer: float) -> None:
+    rng = np.random.default_rng(8)
+    n = 20_000
+    t = rng.normal(size=n) * np.where(rng.random(n) < share, outer, 1.0)
+    found = mixture(t, 3.0)
+    assert abs(found.share - share) < 0.15 * share + 0.005
+    assert abs(found.inner - 1) < 0.05 and abs(found.outer / outer - 1) < 0.15
+    likelihood = [
+        float(np.sum(loss.cost(t))) for loss in (found, Mixture(), Mixture(share / 2, 1.0, outer), Mixture(share, 1.0, 2 * outer))
+    ]
+    assert likelihood[0] == min(likelihood)
+
+
+def test_a_mixture_does_not_believe_that_residuals_are_better_than_declared() -> None:
+    t = np.random.default_rng(9).normal(0, 0.2, 5000)
+    found = mixture(t, 3.0)
+    assert found.inner == 1.0 and found.share < 0.01 and found.outer >= 3.0
+    np.testing.assert_allclose(weight(found, t), 1.0, atol=0.01)
+    assert mixture(np.zeros(0), 3.0) == mixture(np.zeros(0), 3.0)  # no rows, no change
+
+
+def test_self_tuned_weights_are_the_mixtures() -> None:
+    t = np.random.default_rng(10).standard_t(2, 500)
+    np.testing.assert_array_equal(weight(Robust("self-tuned", 3.0), t), mixture(t, 3.0).weight(t))
+    np.testing.assert_array_equal(cost(Robust("self-tuned", 3.0), t), mixture(t, 3.0).cost(t))
+
+
+@pytest.mark.parametrize("kernel", ["cauchy", "geman-mcclure", "tukey", "dcs", "tls"])
 def test_redescending_kernels_forget_gross_errors(kernel: Kernel) -> None:
     """Their influence t w(t) falls towards zero; huber's does not."""
     t = np.array([10.0, 1000.0])

@@ -1,12 +1,16 @@
-"""Fixtures of several test files: a browser."""
+"""Fixtures of several test files: a browser, and commands in this process."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
+
+from scenarios import cli, guard
+from tests.scenarios.damage import Relnav, Run
 
 
 @pytest.fixture(scope="session")
@@ -25,3 +29,19 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(chromedriver))
     yield driver
     driver.quit()
+
+
+@pytest.fixture
+def relnav(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Relnav:
+    """Runs a command in this process; smoothing without report, into the folder `out` beside the flight."""
+    monkeypatch.setattr(guard, "Trace", lambda path: None)
+    monkeypatch.setattr(guard, "run", lambda argv, out, quiet=False: cli.main([*argv, guard.TRACE_OPTION, "unused"]))
+
+    def run(command: str, *argv: object) -> Run:
+        out = Path(str(argv[0])).parent / "out"
+        more = ["--no-report", "--out", str(out)] if command == "smooth" else []
+        code = cli.main([command, *map(str, argv), *more])
+        printed, err = capsys.readouterr()
+        return Run(code, err.splitlines(), printed, out)
+
+    return run

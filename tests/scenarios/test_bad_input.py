@@ -13,19 +13,36 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from factorgraph.solution import Solution
-from scenarios import cli, guard, solutions
+from scenarios import cli, guard
 from scenarios.simulate import simulate
 from scenarios.simulate.scenario import parse
 from scenarios.simulate.write import write_flight
 from tests.helpers import ROOT, interruptible
+from tests.scenarios.damage import (
+    TOML,
+    Damage,
+    Relnav,
+    Run,
+    both,
+    cells,
+    content,
+    key,
+    later,
+    missing,
+    one_error_line,
+    rows,
+    satellites,
+    scaled,
+    share,
+    swap,
+)
 
 DURATION_S = 20.0
 BASE_AND_ROVER = f"""
@@ -90,9 +107,8 @@ tags = [{ name = "1", vehicle = "one" }, { name = "2", vehicle = "two" }, { name
 max_iterations = 12
 """
 ROVER_OBS, BASE_OBS, NAV, IMU, RANGES = "rover.obs", "base.obs", "flight.nav", "rover-imu.csv", "uwb.csv"
-POSITIONS, HEIGHTS, TRUTH, TOML = "rover-position.csv", "rover-height.csv", "rover-truth.csv", "flight.toml"
+POSITIONS, HEIGHTS, TRUTH = "rover-position.csv", "rover-height.csv", "rover-truth.csv"
 FILES = (ROVER_OBS, BASE_OBS, NAV, IMU, RANGES, POSITIONS, HEIGHTS, TRUTH, TOML)
-Damage = Callable[[Path], object]
 posix = pytest.mark.skipif(os.name != "posix", reason="signals and limits of POSIX")
 
 
@@ -108,134 +124,8 @@ def flight(sound: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(sound, tmp_path / "flight"))
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
-    """How a command ended."""
-
-    code: int
-    err: list[str]  # lines
-    printed: str
-    out: Path
-
-    @property
-    def solution(self) -> Solution:
-        return solutions.load(self.out / "solution")
-
-
-Relnav = Callable[..., Run]
-
-
-@pytest.fixture
-def relnav(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Relnav:
-    """Runs a command in this process; smoothing without report, into the folder `out` beside the flight."""
-    monkeypatch.setattr(guard, "Trace", lambda path: None)
-    monkeypatch.setattr(guard, "run", lambda argv, out, quiet=False: cli.main([*argv, guard.TRACE_OPTION, "unused"]))
-
-    def run(command: str, *argv: object) -> Run:
-        out = Path(str(argv[0])).parent / "out"
-        more = ["--no-report", "--out", str(out)] if command == "smooth" else []
-        code = cli.main([command, *map(str, argv), *more])
-        printed, err = capsys.readouterr()
-        return Run(code, err.splitlines(), printed, out)
-
-    return run
-
-
-# ways to damage a flight
-
-
-def content(file: str, change: Callable[[bytes], bytes]) -> Damage:
-    """Rewrites a file."""
-    return lambda folder: (folder / file).write_bytes(change((folder / file).read_bytes()))
-
-
-def key(old: str, new: str) -> Damage:
-    """Rewrites part of flight.toml, which must be there."""
-
-    def change(text: bytes) -> bytes:
-        assert old.encode() in text
-        return text.replace(old.encode(), new.encode())
-
-    return content(TOML, change)
-
-
-def rows(file: str, change: Callable[[list[str]], Iterable[str]]) -> Damage:
-    """Rewrites the rows of a table, below its header."""
-
-    def change_text(text: bytes) -> bytes:
-        head, *body = text.decode().splitlines()
-        return "\n".join([head, *change(body), ""]).encode()
-
-    return content(file, change_text)
-
-
-def cells(file: str, column: int, value: str, first: int = 0, last: int = 10**6) -> Damage:
-    """Writes a value into a column, from row `first` to before `last`."""
-
-    def change(body: list[str]) -> list[str]:
-        split = [row.split(",") for row in body]
-        for row in split[first:last]:
-            row[column] = value
-        return [",".join(row) for row in split]
-
-    return rows(file, change)
-
-
-def later(file: str, seconds: float) -> Damage:
-    """Adds to the times of a table."""
-
-    def change(body: list[str]) -> list[str]:
-        split = [row.split(",", 1) for row in body]
-        return [f"{float(t) + seconds},{rest}" for t, rest in split]
-
-    return rows(file, change)
-
-
-def satellites(file: str, systems: str, most: int = 99, first: int = 0, last: int = 10**6) -> Damage:
-    """Keeps only satellites of some systems, at most so many, at the epochs from `first` to before `last`."""
-
-    def change(text: bytes) -> bytes:
-        head, *epochs = re.split(r"(?m)^(?=>)", text.decode())
-        for i, epoch in enumerate(epochs[first:last], first):
-            line, *records = epoch.splitlines(keepends=True)
-            kept = [record for record in records if record[0] in systems][:most]
-            epochs[i] = f"{line[:32]}{len(kept):3d}{line[35:]}{''.join(kept)}"
-        return "".join([head, *epochs]).encode()
-
-    return content(file, change)
-
-
-def missing(file: str) -> Damage:
-    return lambda folder: (folder / file).unlink()
-
-
-def both(*damages: Damage) -> Damage:
-    return lambda folder: [damage(folder) for damage in damages]
-
-
-def swap(a: str, b: str) -> Damage:
-    def damage(folder: Path) -> None:
-        first, second = (folder / a).read_bytes(), (folder / b).read_bytes()
-        (folder / a).write_bytes(second)
-        (folder / b).write_bytes(first)
-
-    return damage
-
-
 def noise(seed: int, n: int = 3000) -> bytes:
     return np.random.default_rng(seed).bytes(n)
-
-
-def share(x: float) -> Callable[[bytes], bytes]:
-    return lambda text: text[: int(x * len(text))]
-
-
-def one_error_line(run: Run) -> str:
-    """The only line on stderr, which must be relnav's error line; the exit code must say wrong input."""
-    assert run.code == guard.FAILED, run.err
-    (line,) = run.err
-    assert line.startswith("relnav: error: ")
-    return line
 
 
 WRONG: dict[str, tuple[Damage, tuple[str, ...]]] = {
@@ -307,7 +197,7 @@ WRONG: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "positions beyond the Earth": (cells(POSITIONS, 1, "1e12"), (POSITIONS, "km from the local origin", "frame")),
     "one IMU sample": (rows(IMU, lambda body: body[:1]), (IMU, "1 usable row", "two at least")),
     "IMU without rows": (rows(IMU, lambda body: []), (IMU, "no rows")),
-    "IMU in g": (rows(IMU, lambda body: [_scaled(row, 1, 4, 1 / 9.80665) for row in body]), (IMU, 'accel_unit = "g"')),
+    "IMU in g": (rows(IMU, lambda body: [scaled(row, 1, 4, 1 / 9.80665) for row in body]), (IMU, 'accel_unit = "g"')),
     "time runs backward": (rows(IMU, lambda body: body[::-1]), (IMU, "1000 of 1001 time stamps run backward")),
     "one time for all": (cells(POSITIONS, 0, "3.0"), (POSITIONS, "20 repeat")),
     "unknown key": (
@@ -323,12 +213,6 @@ WRONG: dict[str, tuple[Damage, tuple[str, ...]]] = {
     ),
     "unknown table": (key("[[link]]", "[[links]]"), (TOML, "unknown key links; did you mean link?")),
 }
-
-
-def _scaled(row: str, first: int, last: int, factor: float) -> str:
-    split = row.split(",")
-    split[first:last] = [str(float(cell) * factor) for cell in split[first:last]]
-    return ",".join(split)
 
 
 @pytest.mark.parametrize("case", WRONG)
@@ -453,7 +337,7 @@ def test_a_short_imu_gap_is_bridged_and_noted(flight: Path, relnav: Relnav) -> N
     solution = run.solution
     notes = " ".join(solution.diagnostics.notes)
     assert "rover: no IMU samples from 6.18 to 6.80 s" in notes
-    assert "rover: 8 ranges and heights without IMU samples since the last state are left out" in notes
+    assert "rover: 8 measurements without IMU samples since the last state are left out" in notes
     rover, (pair,) = solution.vehicle("rover"), solution.pairs
     assert pair.truth_enu is not None
     error = np.linalg.norm(pair.baseline_enu - pair.truth_enu, axis=1)

@@ -56,7 +56,7 @@ def test_everything_declared_is_understood() -> None:
     assert uav.gnss is not None and uav.gnss.nav == ("a.nav",)
     assert uav.gnss.noise.noise.elevation_mask_rad == pytest.approx(np.deg2rad(10))
     assert uav.positions[0].time.column == 0
-    assert flight.problem_settings.robust["code"] == Robust("huber", 3.0)
+    assert flight.problem_settings.robust["code"] == Robust("dcs", 3.0)
     assert flight.problem_settings.robust["phase"] == Settings().robust["phase"]
     assert not flight.problem_settings.ambiguity.fix
 

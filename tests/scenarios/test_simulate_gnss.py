@@ -229,6 +229,36 @@ def test_slips_jump_by_integers_and_are_recorded() -> None:
         assert abs(slip.cycles) <= 4 and s.lli[rows[at]] == slip.flagged
 
 
+def test_half_cycles_stand_until_they_are_resolved() -> None:
+    """Eight seconds after lock; slips by half cycles stay."""
+    antenna, record, _ = observed("rest", GnssTable(half_cycle_s=8.0, outages=(Outage(start_s=20, end_s=24),)), 40.0, 0.0)
+    s, calm = antenna.stream, observed("rest", GnssTable(outages=(Outage(start_s=20, end_s=24),)), 40.0, 0.0)[0].stream
+    t = s.t_s[s.epoch]
+    unresolved = (t < 8 - 1e-9) | ((t >= 24) & (t < 32 - 1e-9))
+    np.testing.assert_array_equal((s.lli & 2) > 0, unresolved)
+    np.testing.assert_allclose(s.phase_cyc - calm.phase_cyc, 0.5 * record.half, atol=1e-6)
+    assert set(record.half.tolist()) == {0, 1} and not np.any(record.half[~unresolved])
+    table = GnssTable(rate_hz=5.0, slips_per_hour=60.0, slip_half_probability=0.5)
+    _, record, _ = observed("rest", table, 120.0, 0.0)
+    assert {slip.cycles % 1 for slip in record.slips} == {0.0, 0.5}
+
+
+def test_clocks_are_set_back_by_milliseconds_with_the_phases_or_without() -> None:
+    tables = [ClockTable(drift=5e-5, limit_s=5e-4, phase_follows=follow) for follow in (True, False)]
+    streams, records = zip(
+        *((antenna.stream, record) for antenna, record, _ in (observed("rest", GnssTable(clock=c), 60.0, 0.0) for c in tables)),
+        strict=True,
+    )
+    step = np.diff(records[0].clock_s)
+    jumps = np.flatnonzero(np.abs(step) > 5e-4)
+    assert len(jumps) >= 1 and np.abs(records[0].clock_s).max() < 5.6e-4
+    np.testing.assert_allclose(step[jumps] - np.median(step), -1e-3 * np.sign(np.median(step)), atol=1e-5)
+    np.testing.assert_array_equal(streams[0].code_m, streams[1].code_m)
+    apart = (streams[1].phase_cyc - streams[0].phase_cyc) * streams[0].wavelength_m / 299_792.458
+    np.testing.assert_allclose(apart, np.rint(apart), atol=1e-6)
+    assert len(np.unique(np.rint(apart))) == len(jumps) + 1
+
+
 def test_after_an_outage_tracking_starts_with_another_integer() -> None:
     free, _, _ = observed("rest", GnssTable(), 30.0, 0.0)
     name = free.stream.satellites[0]
