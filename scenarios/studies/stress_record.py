@@ -134,7 +134,7 @@ def write(results: Results[Job], folder: Path, options: argparse.Namespace) -> O
     (folder / "stress.json").write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
     (folder / "stress.md").write_text(markdown(summaries, command), encoding="utf-8")
     write_page(_page(summaries, command), folder / "report.html")
-    said = [f"{s.name}: RMSE ratio {_interval(s.ratio, 1.0, 3)}, {s.found}" for s in summaries]
+    said = [", ".join(filter(None, [f"{s.name}: RMSE ratio {_interval(s.ratio, 1.0, 3)}", s.found])) for s in summaries]
     return Outcome((*said, f"written: stress.json, stress.md, report.html in {folder}"))
 
 
