@@ -377,9 +377,9 @@ class EndsBlock(Block):
 
     columns_of: Columns = field(init=False)
 
+    @abstractmethod
     def ends(self) -> list[Endpoint]:
         """The ends, in the order of the columns."""
-        raise NotImplementedError
 
     def parameters(self) -> list[Parameter]:
         """Parameters besides those of the ends."""

@@ -15,6 +15,7 @@ Source: Groves (2013), ch. 6 and 16, for odometer, magnetometer and their errors
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -90,9 +91,9 @@ class VectorBlock(EndsBlock):
     def regroup(self) -> None:
         self.rows.factor = CommonGroups.from_labels(interval_of(self.measured.ends)[self.of_row])
 
+    @abstractmethod
     def model(self) -> Model:
         """Residuals of every component and their Jacobians, at the current variables."""
-        raise NotImplementedError
 
     def predict(self) -> None:
         at = (self.of_row, self.component)
