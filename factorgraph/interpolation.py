@@ -1,7 +1,7 @@
 """A solution between its states, up to IMU rate.
 
 From the state k before, at its estimated bias, increments of the IMU (`factorgraph.models.preintegration`) carry the
-vehicle to t = t_k + dt (`factorgraph.graphs.variables`):
+vehicle to t = t_k + dt (`factorgraph.assembly.variables`):
 
     R_p = Exp(-w_ie dt) R_k dR,   v_p = v_k + (g - 2 w_ie x v_k) dt + R_k dv,
     r_p = r_k + v_k dt + (g - 2 w_ie x v_k) dt^2 / 2 + R_k dp

@@ -1,6 +1,5 @@
-"""GTSAM factor graphs: variables on a time grid, vectorised measurement blocks, our own outer loop.
+"""GTSAM as the engine of assembled problems: elimination in the order of time, covariances, the whole flight as one graph.
 
-`variables` owns keys and trajectories, `blocks` the measurements, `inertial_block` the IMUs, `inertial` priors of states and
-motion, `optimizer` the iterations, `ordering` the order of elimination, `covariance` the joint covariances, `batch` the whole
-flight.
+`engine` linearises and eliminates, `ordering` says in what order, `covariance` reads joint covariances off the Bayes net,
+`batch` is the method, `bound` the posterior Cramer-Rao bound.
 """

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from factorgraph.assembly import phases
+from factorgraph.assembly.build import build
+from factorgraph.assembly.pairs import pair_covariance, pair_ends
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.attitude import matrix_from_quat
-from factorgraph.graphs import phases
-from factorgraph.graphs.build import build
-from factorgraph.graphs.covariance import JointCovariance
-from factorgraph.graphs.pairs import pair_covariance, pair_ends
-from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.graphs.engine import GtsamEngine
 from factorgraph.grid import common_grid
 from factorgraph.models.receivers import receivers
 from factorgraph.problem import NavigationProblem
@@ -40,18 +40,18 @@ def posterior_bound(problem: NavigationProblem, integers_known: bool = True) -> 
         if truth.q_nb is not None:
             near = np.clip(np.searchsorted(truth.t_s, grid - 1e-6), 0, len(truth.t_s) - 1)
             v.R = matrix_from_quat(truth.q_nb[near])
-    built = build(problem, vehicles, receivers(problem), use_phase=True)
+    built = build(problem, vehicles, receivers(problem), use_phase=True, engine=GtsamEngine())
     for data in built.links:
         phases.prepare(data, problem.settings.ambiguity)
         if integers_known:
             data.block.amb_key[:] = 0
             data.block.renew()
     built.graph.assemble()
-    built.graph.take(built.graph.values)
-    net = built.graph.covariance_net()
-    if net is None:
+    built.graph.predict()
+    eliminated = built.graph.eliminate(joints=True)
+    if eliminated is None:
         raise ValueError("the problem is singular at the truth")
-    cov = JointCovariance(net)
+    cov = eliminated.covariances()
     return grid, {
         (p.reference, p.rover): pair_covariance(problem, pair_ends(problem, vehicles, p), cov) for p in problem.wanted_pairs
     }

@@ -8,7 +8,7 @@
     tls              rho = t^2/2 inside c, c^2/2 outside
     self-tuned       rho = -log(sqrt(2 pi) p(t)), p a mixture of two normal distributions that the residuals themselves decide
 
-All but huber have local minima: from far away they need graduation (`graphs.graduated`). With a factor s, a residual s t
+All but huber have local minima: from far away they need graduation (`assembly.graduated`). With a factor s, a residual s t
 and a width s c give s^2 rho(t) and the same weight.
 
 "dcs" is dynamic covariance scaling: a row's weight is s^2 with s = min(1, 2 c^2 / (c^2 + t^2)), what a switch variable of

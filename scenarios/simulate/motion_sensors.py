@@ -1,7 +1,7 @@
 """Odometers, attitude systems, magnetometers and cameras with white noise, and with the errors that estimators are told of.
 
 A scale, a mounting or a hard iron that the estimator is to find is drawn from the prior it is told: z = (1 + s) C_bs^T x_b + b,
-C_bs = Exp(m), as in factorgraph.graphs.sensors.
+C_bs = Exp(m), as in factorgraph.assembly.sensors.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
+from factorgraph.assembly.sensors import directions
 from factorgraph.attitude import exp_so3, quat_from_matrix
 from factorgraph.errors import InputError
-from factorgraph.graphs.sensors import directions
 from factorgraph.measurements import AttitudeStream, Calibration, MagneticStream, Tag, VelocityStream, VisionStream
 from factorgraph.problem import Vec3
 from factorgraph.types import Array

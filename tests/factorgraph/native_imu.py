@@ -5,8 +5,8 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from factorgraph.graphs.inertial_block import INTEGRATION_SIGMA_M
-from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.assembly.inertial_block import INTEGRATION_SIGMA_M
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.models.preintegration import grouped_inputs
 
 
@@ -34,3 +34,12 @@ def add_imu_factors(graph: gtsam.NonlinearFactorGraph, vehicle: VehicleVariables
             pim.integrateMeasurement(inputs.f_b[i], inputs.w_b[i], inputs.dt_s[i])
         a, b = vehicle.keys(k), vehicle.keys(k + 1)
         graph.add(gtsam.CombinedImuFactor(a[0], a[1], b[0], b[1], a[2], b[2], pim))
+
+
+def insert_states(values: gtsam.Values, v: VehicleVariables) -> None:
+    """A vehicle's states as GTSAM has them."""
+    for k in range(len(v.t_s)):
+        pose, velocity, bias = v.keys(k)
+        values.insert(pose, gtsam.Pose3(gtsam.Rot3(v.R[k]), v.r[k]))
+        values.insert(velocity, v.v[k])
+        values.insert(bias, gtsam.imuBias.ConstantBias(v.bias[k, 3:], v.bias[k, :3]))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from factorgraph.alignment import Alignment, Directions, align, course
+from factorgraph.assembly.attitudes import between_fixes, directions_of
 from factorgraph.attitude import euler_from_matrix, exp_so3, log_so3, matrix_from_euler, quat_from_matrix
 from factorgraph.geodesy import LocalFrame
-from factorgraph.graphs.attitudes import between_fixes, directions_of
 from factorgraph.measurements import AttitudeStream, Calibration, ImuStream, MagneticStream, PositionStream
 from factorgraph.models.strapdown import ideal_imu
 from factorgraph.problem import ImuNoise, Vehicle

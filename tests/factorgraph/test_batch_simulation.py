@@ -9,8 +9,8 @@ from functools import cache
 import numpy as np
 import pytest
 
+from factorgraph.assembly.blocks import Block
 from factorgraph.attitude import log_so3, matrix_from_quat
-from factorgraph.graphs.blocks import Block
 from factorgraph.problem import Link, NavigationProblem
 from factorgraph.registry import solve
 from factorgraph.solution import POS, Fix, PairSolution, Solution, Status

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.linalg import solveh_banded
 
+from factorgraph.assembly.variables import key
 from factorgraph.graphs.covariance import JointCovariance, covariance_of
-from factorgraph.graphs.optimizer import eliminate
-from factorgraph.graphs.variables import key
+from factorgraph.graphs.engine import eliminate
 from factorgraph.types import Array
 
 

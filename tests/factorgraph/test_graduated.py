@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from factorgraph.graphs.graduated import TLS_END, approach, relaxations, relaxed
-from factorgraph.graphs.optimizer import Graph
+from factorgraph.assembly.graduated import TLS_END, approach, relaxations, relaxed
+from factorgraph.assembly.optimizer import Graph
 from factorgraph.models.robust import RelaxedTls, weight
 from factorgraph.problem import Kernel, Robust
 from tests.factorgraph.test_optimizer import measured, ranging, rms, run

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from factorgraph.assembly.remarks import LISTED_GAPS, gap_remarks, unplaced_notes
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.geodesy import LocalFrame
 from factorgraph.gpstime import GpsTime
-from factorgraph.graphs.remarks import LISTED_GAPS, gap_remarks, unplaced_notes
-from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.measurements import HeightStream, ImuStream, PositionStream, RangeStream, Tag
 from factorgraph.models.preintegration import crossing, gaps, integrate, sample_means
 from factorgraph.problem import Link, NavigationProblem, RangeModel, Vehicle

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from factorgraph.graphs import integers, optimizer
-from factorgraph.graphs.integers import groups_in_time
+from factorgraph.assembly import integers, optimizer
+from factorgraph.assembly.integers import groups_in_time
 from factorgraph.registry import solve
 from factorgraph.solution import Solution
 from scenarios.simulate import load_scenario, simulate

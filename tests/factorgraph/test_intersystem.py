@@ -8,10 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from factorgraph.graphs.blocks import CODE, DOPPLER, PHASE
-from factorgraph.graphs.integers import datum_arcs
-from factorgraph.graphs.intersystem import biases, shared_clocks
-from factorgraph.graphs.parameters import Parameters
+from factorgraph.assembly.blocks import CODE, DOPPLER, PHASE
+from factorgraph.assembly.integers import datum_arcs
+from factorgraph.assembly.intersystem import biases, shared_clocks
+from factorgraph.assembly.parameters import Parameters
 from factorgraph.problem import NavigationProblem
 from factorgraph.registry import solve
 from factorgraph.solution import Fix

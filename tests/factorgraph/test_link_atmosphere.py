@@ -8,14 +8,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from factorgraph.graphs import wide_lanes
-from factorgraph.graphs.atmosphere import NodeBlock, add_ionosphere, add_wet_delay, wet_sigma_m
-from factorgraph.graphs.blocks import CODE, DOPPLER, PHASE, GnssBlock
-from factorgraph.graphs.build import link_block
-from factorgraph.graphs.integers import start_ambiguities
-from factorgraph.graphs.nodes import Nodes, Process
-from factorgraph.graphs.parameters import Parameters
-from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.assembly import wide_lanes
+from factorgraph.assembly.atmosphere import NodeBlock, add_ionosphere, add_wet_delay, wet_sigma_m
+from factorgraph.assembly.blocks import CODE, DOPPLER, PHASE, GnssBlock
+from factorgraph.assembly.build import link_block
+from factorgraph.assembly.integers import start_ambiguities
+from factorgraph.assembly.nodes import Nodes, Process
+from factorgraph.assembly.parameters import Parameters
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.grid import common_grid
 from factorgraph.models.receivers import receivers
 from factorgraph.problem import Settings
@@ -52,7 +52,7 @@ def test_jacobians_of_delays_and_their_processes() -> None:
     assert_jacobians(graph, block, GNSS_STEP, CARRIED)
     for prior in known:
         assert_jacobians(graph, prior, GNSS_STEP)
-        assert {len(prior.keys(f)) for f in range(prior.n)} == {1, 2}
+        assert {len(prior.columns(f)[0]) for f in range(prior.n)} == {1, 2}
 
 
 def test_code_and_phase_bend_opposite_ways_and_wet_delays_alike() -> None:

@@ -6,9 +6,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from factorgraph.graphs.optimizer import eliminate
+from factorgraph.assembly.variables import key
+from factorgraph.graphs.engine import eliminate
 from factorgraph.graphs.ordering import Lives, elimination_order, nested_ranks
-from factorgraph.graphs.variables import key
 from tests.factorgraph.test_covariance import linear, linearized
 
 

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 import pytest
 
+from factorgraph.assembly.barometer import BarometerBlock
+from factorgraph.assembly.blocks import Block
+from factorgraph.assembly.build import position_blocks
+from factorgraph.assembly.constraints import constraint_blocks
+from factorgraph.assembly.parameters import Parameters
+from factorgraph.assembly.sensors import HeadingBlock, sensor_blocks
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.attitude import exp_so3, matrix_from_euler, quat_from_matrix, right_jacobian, right_jacobian_inverse
 from factorgraph.errors import InputError
 from factorgraph.gpstime import GpsTime
-from factorgraph.graphs.barometer import BarometerBlock
-from factorgraph.graphs.blocks import Block
-from factorgraph.graphs.build import position_blocks
-from factorgraph.graphs.constraints import constraint_blocks
-from factorgraph.graphs.parameters import Parameters
-from factorgraph.graphs.sensors import HeadingBlock, sensor_blocks
-from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.measurements import (
     AttitudeStream,
     Calibration,
@@ -31,7 +30,7 @@ from factorgraph.measurements import (
 from factorgraph.problem import Constraints, ImuCalibration, NavigationProblem, Vehicle
 from factorgraph.types import Array
 from tests.factorgraph.synthetic import FRAME
-from tests.factorgraph.test_blocks import CARRIED, GRID, LEVER, assert_jacobians, evaluated, variables
+from tests.factorgraph.test_blocks import CARRIED, GRID, LEVER, assert_jacobians, evaluated, letter_of, variables
 from tests.factorgraph.test_blocks import vehicle as bare_vehicle
 
 STEP = {"x": (1e-4, 1e-3), "p": (1e-2,), "v": (1e-2,), "b": (1e-2, 1e-4), "s": (1e-4,), "l": (1e-4,), "c": (1e-4,)}
@@ -96,7 +95,7 @@ def test_odometer(where: str, calibrated: bool) -> None:
     stream = VelocityStream(t, v_b, np.full((len(t), 3), 0.1), LEVER["a"], calibration=calibration)
     (block,) = check(*graph_of(vehicle(velocities=(stream,))), 5e-5 if where == "at states" else CARRIED)
     assert block.n == len(t) + 2 * (len(t) // 2)
-    letters = {chr(gtsam.symbolChr(k)) for k in block.keys(0)}
+    letters = {letter_of(k) for k in block.keys(0)}
     assert ({"c", "l"} <= letters) == calibrated
 
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from factorgraph.alignment import Alignment
+from factorgraph.assembly import attitudes
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.attitude import exp_so3, log_so3, matrix_from_quat
-from factorgraph.graphs import attitudes
-from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.graphs.engine import GtsamEngine
 from factorgraph.grid import common_grid
 from factorgraph.models.receivers import receivers
 from factorgraph.problem import NavigationProblem
@@ -102,7 +103,7 @@ def test_several_starts_find_what_alignment_leaves_open(off_rad: float) -> None:
     open_heading = Alignment(
         exp_so3(np.array([0.0, 0.0, off_rad])) @ C, np.zeros((len(grid), 6)), "levelling", np.array([0.03, 0.03, 3.0]), None
     )
-    found = attitudes._compared(problem, uav, rough, rx, open_heading)
+    found = attitudes._compared(problem, uav, rough, rx, GtsamEngine, open_heading)
     assert found.way == "starts compared"
     assert np.abs(log_so3(found.C_nb @ np.swapaxes(C, 1, 2))[:, 2]).max() < 0.5
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ambiguity import partial
-from factorgraph.graphs import integers, switches
+from factorgraph.assembly import integers, switches
 from factorgraph.models.robust import weight
 from factorgraph.problem import NavigationProblem
 from factorgraph.registry import solve

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from factorgraph.assembly.build import build
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.attitude import euler_from_matrix, exp_so3, log_so3, matrix_from_quat
 from factorgraph.errors import InputError
-from factorgraph.graphs.build import build
-from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.graphs.engine import GtsamEngine
 from factorgraph.grid import common_grid
 from factorgraph.interpolation import resample
 from factorgraph.measurements import PositionStream
@@ -169,7 +170,7 @@ def test_jacobians_of_two_points_of_one_body() -> None:
     body = bodies[0]
     body.v[:] = rng.normal(0, 1.0, body.v.shape)
     body.R[:] = exp_so3(rng.normal(0, 1.0, (len(grid), 3)))
-    block = build(problem, bodies, receivers(problem), use_phase=False).graph.gnss[0]
+    block = build(problem, bodies, receivers(problem), use_phase=False, engine=GtsamEngine()).graph.gnss[0]
     assert block.reference is not None and block.rover.vehicle is block.reference.vehicle
     np.testing.assert_array_equal(block.rover.query.k, block.reference.query.k)
     for f in range(0, len(block.rows.factor.start), 7):

@@ -3,7 +3,7 @@
 A link long enough has, per satellite, a differential vertical ionosphere at L1 (rover minus reference), seen with the
 obliquity F(el) = 1 + 16 (0.53 - el)^3 (el in semicircles) and (lambda / lambda_L1)^2, plus sign for code and minus for
 phase, and one differential wet delay of the zenith, seen with Niell's wet mapping of the rover's elevation. Both are
-Gauss-Markov processes (`graphs.nodes`) whose standard deviation grows with the baseline: the ionosphere-weighted model.
+Gauss-Markov processes (`assembly.nodes`) whose standard deviation grows with the baseline: the ionosphere-weighted model.
 
 Source: IS-GPS-200, 20.3.3.5.2.5 (obliquity); Schaffrin and Bock (1988), Odijk (2002) for weighting the differential ionosphere.
 """
@@ -12,14 +12,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
+from factorgraph.assembly.blocks import CODE, PHASE, Block, GnssBlock
+from factorgraph.assembly.nodes import Nodes, Process
+from factorgraph.assembly.rows import plain_rows
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.geodesy import geodetic_from_ecef
-from factorgraph.graphs.blocks import CODE, PHASE, Block, GnssBlock
-from factorgraph.graphs.nodes import Nodes, Process
-from factorgraph.graphs.rows import plain_rows
-from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.models.atmosphere import niell_wet
 from factorgraph.models.combinations import ionosphere_free
 from factorgraph.models.gnss import (
@@ -46,7 +45,7 @@ class NodeBlock(Block):
     def keys(self, f: int) -> list[int]:
         before = self.of.previous[f]
         own = int(self.of.key[f])
-        return [own] if before < 0 else [own, int(self.of.key[before])]
+        return [own, 0 if before < 0 else int(self.of.key[before])]
 
     def widths(self) -> tuple[int, ...]:
         return (1, 1)
@@ -55,12 +54,6 @@ class NodeBlock(Block):
         x, before = self.of.value, self.of.previous
         self.y = -np.where(before >= 0, x - self.decay * x[before], x)
         self.J = np.column_stack([np.ones(self.n), -self.decay])
-
-    def columns(self, f: int) -> list[Array]:
-        return Block.columns(self, f)[: len(self.keys(f))]
-
-    def _carrier(self, f: int, i: int, j: int, edges: list[tuple[int, int]]) -> gtsam.CustomFactor:
-        return Block._carrier(self, f, i, j, edges[: len(self.keys(f))])
 
 
 def node_block(nodes: Nodes, process: Process, source: str) -> NodeBlock:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from factorgraph.graphs.covariance import JointCovariance
-from factorgraph.graphs.parameters import Parameter
-from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.assembly.engine import Covariances
+from factorgraph.assembly.parameters import Parameter
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.problem import NavigationProblem
 from factorgraph.solution import VehicleSolution
 from factorgraph.types import Array
@@ -78,7 +78,7 @@ def unplaced_notes(problem: NavigationProblem) -> list[str]:
     return notes
 
 
-def untold_notes(parameters: Sequence[Parameter], cov: JointCovariance | None) -> list[str]:
+def untold_notes(parameters: Sequence[Parameter], cov: Covariances | None) -> list[str]:
     """A note for every direction among the estimated constants that the data do not fix.
 
     Directions are eigenvectors of the joint posterior covariance over the priors' standard deviations: several constants may

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph.graphs.blocks import Block, GnssBlock
-from factorgraph.graphs.rows import plain_rows
+from factorgraph.assembly.blocks import Block, GnssBlock
+from factorgraph.assembly.rows import plain_rows
 from factorgraph.models.robust import Loss, cost, weight
 from factorgraph.problem import Robust
 from factorgraph.types import Array, IntArray
@@ -42,6 +42,10 @@ class SwitchBlock(Block):
     @property
     def is_stale(self) -> bool:
         return self.valid_for is not self.of.amb_key
+
+    @property
+    def version(self) -> tuple[int, ...]:
+        return (self.of.structure, int(self.active.sum()))
 
     def keys(self, f: int) -> list[int]:
         return [int(self.of.amb_key[self.arc[f]])]

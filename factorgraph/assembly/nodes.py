@@ -13,9 +13,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import gtsam
 import numpy as np
 
+from factorgraph.assembly.keys import symbol
 from factorgraph.types import Array, IntArray
 
 LETTER = "i"  # of the nodes' keys
@@ -66,7 +66,7 @@ class Nodes:
         share = np.concatenate([scale * (1 - late), scale * late])
         seen = np.concatenate([1 - late, late]) > LEAST
         used, node = np.unique(label[seen], return_inverse=True)
-        keys = np.array([gtsam.symbol(LETTER, first_key + i) for i in range(len(used))], np.int64)
+        keys = np.array([symbol(LETTER, first_key + i) for i in range(len(used))], np.int64)
         return cls(name, keys, t_s.min() + used % width * step_s, used // width, row[seen], node, share[seen])
 
     @property
@@ -78,12 +78,3 @@ class Nodes:
     def seen(self, n: int) -> Array:
         """What each of the block's n rows sees of the nodes at their values."""
         return np.asarray(np.bincount(self.row, self.scale * self.value[self.node], minlength=n), float)
-
-
-def take_nodes(values: gtsam.Values, every: list[Nodes]) -> None:
-    """Take all nodes' values, which GTSAM hands out in the order of their keys."""
-    if not every:
-        return
-    table, keys = gtsam.utilities.extractVectors(values, LETTER)[:, 0], np.sort(np.concatenate([nodes.key for nodes in every]))
-    for nodes in every:
-        nodes.value = table[np.searchsorted(keys, nodes.key)]

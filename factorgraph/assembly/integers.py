@@ -9,16 +9,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
 from ambiguity import partial
-from factorgraph.graphs import switches
-from factorgraph.graphs.blocks import CODE, PHASE, GnssBlock
-from factorgraph.graphs.build import GnssLink
-from factorgraph.graphs.covariance import covariance_of
-from factorgraph.graphs.intersystem import start_biases
-from factorgraph.graphs.optimizer import Graph
+from factorgraph.assembly import switches
+from factorgraph.assembly.blocks import CODE, PHASE, GnssBlock
+from factorgraph.assembly.build import GnssLink
+from factorgraph.assembly.engine import Eliminated
+from factorgraph.assembly.intersystem import start_biases
+from factorgraph.assembly.optimizer import Graph
 from factorgraph.problem import AmbiguitySettings
 from factorgraph.types import Array, IntArray
 
@@ -120,7 +119,7 @@ def groups_in_time(start_s: Array, end_s: Array) -> list[IntArray]:
     return [np.sort(part) for part in np.array_split(order, -(-len(order) // GROUP))]
 
 
-def fix_integers(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNet, settings: AmbiguitySettings) -> FixRound:
+def fix_integers(graph: Graph, links: list[GnssLink], eliminated: Eliminated, settings: AmbiguitySettings) -> FixRound:
     """Fix what can be fixed of all free ambiguities jointly; fixed ones become constants."""
     free = [
         (data, i)
@@ -131,8 +130,8 @@ def fix_integers(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNe
     if not free:
         return FixRound(0, np.nan, 1.0)
     keys = [int(d.block.amb_key[i]) for d, i in free]
-    present = [k for k in keys if graph.values.exists(k)]
-    free = [f for f, k in zip(free, keys, strict=True) if graph.values.exists(k)]
+    present = [k for k in keys if k in graph.ambiguities]
+    free = [f for f, k in zip(free, keys, strict=True) if k in graph.ambiguities]
     if not present:
         return FixRound(0, np.nan, 1.0)
     a = np.array([d.block.amb_value[i] for d, i in free])
@@ -142,7 +141,7 @@ def fix_integers(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNe
             data.float_cyc, data.float_sigma = data.block.amb_value.copy(), np.full(len(data.block.amb_key), np.nan)
     is_fixed, integers, ratios, success = np.zeros(len(a), bool), a.copy(), [], 1.0
     for group in groups_in_time(start_s, end_s):
-        Q = covariance_of(net, [present[j] for j in group])
+        Q = eliminated.covariance([present[j] for j in group])
         for j, sigma in zip(group.tolist(), np.sqrt(np.diag(Q)).tolist(), strict=True):
             data, i = free[j]
             if np.isnan(data.float_sigma[i]):

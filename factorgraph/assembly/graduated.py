@@ -20,8 +20,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph.graphs.blocks import KINDS
-from factorgraph.graphs.optimizer import Graph, optimise
+from factorgraph.assembly.blocks import KINDS
+from factorgraph.assembly.optimizer import Graph, optimise
 from factorgraph.models.robust import Loss, RelaxedTls
 from factorgraph.problem import Robust
 from factorgraph.types import Array

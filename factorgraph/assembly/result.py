@@ -1,4 +1,4 @@
-"""The solution of a graph: trajectories with covariances, pairs, ambiguities, residuals, diagnostics."""
+"""The solution of a problem: trajectories with covariances, pairs, ambiguities, residuals, diagnostics."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
+from factorgraph.assembly.blocks import CODE, CONSTRAINT, KINDS, Block, GnssBlock
+from factorgraph.assembly.build import Built, GnssLink
+from factorgraph.assembly.engine import Covariances
+from factorgraph.assembly.optimizer import Graph, Result
+from factorgraph.assembly.pairs import PairEnd, pair_covariance, pair_ends, pair_truth
+from factorgraph.assembly.phases import slip_table
+from factorgraph.assembly.remarks import gap_remarks, heading_notes, unplaced_notes, untold_notes
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.attitude import quat_from_matrix
-from factorgraph.graphs.blocks import CODE, CONSTRAINT, KINDS, Block, GnssBlock
-from factorgraph.graphs.build import Built, GnssLink
-from factorgraph.graphs.covariance import JointCovariance
-from factorgraph.graphs.optimizer import Graph, Result
-from factorgraph.graphs.pairs import PairEnd, pair_covariance, pair_ends, pair_truth
-from factorgraph.graphs.phases import slip_table
-from factorgraph.graphs.remarks import gap_remarks, heading_notes, unplaced_notes, untold_notes
-from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.models.differencing import CommonGroups
 from factorgraph.models.outliers import classify
 from factorgraph.problem import Link, NavigationProblem, Sensor
@@ -44,12 +44,12 @@ BETWEEN_EPOCHS_S = 2.0  # a state between two epochs no further apart shares the
 
 
 def make_solution(
-    problem: NavigationProblem, built: Built, result: Result, ratio: float, spent: dict[str, float], notes: list[str]
+    problem: NavigationProblem, method: str, built: Built, result: Result, ratio: float, spent: dict[str, float], notes: list[str]
 ) -> Solution:
     """Collect everything known after the optimisation."""
     graph = built.graph
-    net = graph.covariance_net()
-    cov = JointCovariance(net) if net is not None else None
+    eliminated = graph.eliminate(joints=True)
+    cov = eliminated.covariances() if eliminated is not None else None
     vehicles = tuple(_vehicle(v, cov) for v in graph.vehicles)
     links = {(d.link.reference, d.link.rover): d for d in built.links}
     pairs = tuple(_pair(problem, p, built, cov, links, ratio) for p in problem.wanted_pairs)
@@ -60,7 +60,7 @@ def make_solution(
     gap_notes, gap_warnings = gap_remarks(problem, graph.vehicles)
     return Solution(
         name=problem.name,
-        method="graph",
+        method=method,
         t0=problem.t0,
         frame=problem.frame,
         vehicles=vehicles,
@@ -75,21 +75,21 @@ def make_solution(
             nis_t_s=nis_t,
             nis=nis,
             nis_dof=dof,
-            warnings=(*_warnings(problem, built, result.status, net is None, pairs), *gap_warnings),
+            warnings=(*_warnings(problem, built, result.status, cov is None, pairs), *gap_warnings),
             notes=(*notes, *_clock_notes(built), *_slip_notes(built.links, slips), *gap_notes, *unplaced_notes(problem), *told),
             parameters=(*_parameters(graph, cov), *built.noise),
         ),
         configuration=configuration(problem),
-        versions=versions(),
+        versions=versions(graph.engine.packages),
         slips=slips,
         carriers={v.name: v.carrier for v in problem.vehicles if v.carrier is not None},
     )
 
 
-def versions() -> dict[str, str]:
-    """Versions of what computed the solution."""
+def versions(packages: tuple[str, ...]) -> dict[str, str]:
+    """Versions of what computed the solution: this package, those of every method, and an engine's."""
     found = {"python": platform.python_version()}
-    for name in ("relnav", "gtsam", "numpy", "scipy", "numba"):
+    for name in ("relnav", *packages, "numpy", "scipy", "numba"):
         try:
             found[name] = version(name)
         except PackageNotFoundError:
@@ -152,7 +152,7 @@ def _state_map(v: VehicleVariables, k: int) -> Array:
     return T
 
 
-def _vehicle(v: VehicleVariables, cov: JointCovariance | None) -> VehicleSolution:
+def _vehicle(v: VehicleVariables, cov: Covariances | None) -> VehicleSolution:
     K = len(v.t_s)
     P = np.full((K, 15, 15), np.nan)
     nan3 = np.full((K, 3), np.nan)
@@ -172,7 +172,7 @@ def _pair(
     problem: NavigationProblem,
     pair: Link,
     built: Built,
-    cov: JointCovariance | None,
+    cov: Covariances | None,
     links: dict[tuple[str, str], GnssLink],
     ratio: float,
 ) -> PairSolution:
@@ -257,7 +257,7 @@ def _fix_status(link: GnssLink | None, rover: VehicleVariables, K: int, ratio: f
     return fix, n_sat, ratios
 
 
-def _ambiguities(graph: Graph, links: list[GnssLink], cov: JointCovariance | None) -> AmbiguityTable:
+def _ambiguities(graph: Graph, links: list[GnssLink], cov: Covariances | None) -> AmbiguityTable:
     links = [data for data in links if len(data.state)]
     if not links:
         return AmbiguityTable()
@@ -267,7 +267,7 @@ def _ambiguities(graph: Graph, links: list[GnssLink], cov: JointCovariance | Non
         state = np.array(data.state)
         held = np.isin(state, ["fixed", "datum"])
         sigma = np.where(state == "fixed", data.float_sigma, np.nan) if len(data.float_sigma) else np.full(len(keys), np.nan)
-        free = np.array([k != 0 and graph.values.exists(int(k)) for k in keys])
+        free = np.array([k != 0 and int(k) in graph.ambiguities for k in keys])
         if np.any(free) and cov is not None:
             sigma[free] = np.sqrt(cov.joints(keys[free][:, None])[:, 0, 0])
         names += [f"{data.link.reference}-{data.link.rover}"] * len(keys)
@@ -337,7 +337,7 @@ def _index(names: list[str], name: str) -> int:
     return names.index(name)
 
 
-def _nis(graph: Graph, cov: JointCovariance | None) -> tuple[Array, Array, Array]:
+def _nis(graph: Graph, cov: Covariances | None) -> tuple[Array, Array, Array]:
     """Sum of squared whitened residuals and its expectation per state time.
 
     E[e^T e] = rows - clocks - trace(J P J^T) for a factor with whitened Jacobian J and posterior covariance P of its
@@ -362,19 +362,14 @@ def _nis(graph: Graph, cov: JointCovariance | None) -> tuple[Array, Array, Array
             observed = counts[first] & (b.rows.clocks.sum(b.active.astype(float)) > 0)
             np.subtract.at(expected, b.rows.factor.of_row[first], observed.astype(float))
         k = np.clip(np.searchsorted(t, b.rows.t_s[starts] + 5e-3, side="right") - 1, 0, len(t) - 1)
-        keys = [b.keys(f) for f in range(len(starts))]
-        alike = len({len(each) for each in keys}) == 1
-        P = cov.joints(keys) if alike and keys[0] else [cov.joint(each) if each else np.zeros((0, 0)) for each in keys]
-        for f in range(len(starts)):
-            i, j = b.slices(f)
-            J = np.hstack(b.columns(f))[counts[i:j]]
-            total[k[f]] += sq[f]
-            dof[k[f]] += max(expected[f] - float(np.sum((J @ P[f]) * J)), 0.0)
+        expected -= b.rows.factor.sum(np.where(counts, b.explained(cov), 0.0))
+        np.add.at(total, k, sq)
+        np.add.at(dof, k, np.maximum(expected, 0.0))
     seen = dof > 0
     return t[seen], total[seen], dof[seen]
 
 
-def _parameters(graph: Graph, cov: JointCovariance | None) -> tuple[ParameterEstimate, ...]:
+def _parameters(graph: Graph, cov: Covariances | None) -> tuple[ParameterEstimate, ...]:
     """Every estimated constant with its prior."""
     out = []
     for p in graph.parameters:

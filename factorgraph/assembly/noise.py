@@ -19,10 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph.graphs.blocks import CODE, DOPPLER, KINDS, PHASE, RANGE, Block, GnssBlock
-from factorgraph.graphs.build import GnssLink
-from factorgraph.graphs.covariance import JointCovariance
-from factorgraph.graphs.optimizer import Graph
+from factorgraph.assembly.blocks import CODE, DOPPLER, KINDS, PHASE, RANGE, Block, GnssBlock
+from factorgraph.assembly.build import GnssLink
+from factorgraph.assembly.engine import Covariances
+from factorgraph.assembly.optimizer import Graph
 from factorgraph.models.noise import Components, components, scale
 from factorgraph.models.receivers import Receiver
 from factorgraph.problem import NoiseModel
@@ -49,16 +49,10 @@ def declared(graph: Graph) -> list[Declared]:
     return [Declared(b, b.rows.sigma.copy()) for b in graph.blocks if np.any(np.isin(b.rows.kind, list(UNIT)))]
 
 
-def redundancies(block: Block, cov: JointCovariance) -> Array:
+def redundancies(block: Block, cov: Covariances) -> Array:
     """Redundancy number (n,) of every row: the share of its noise that its residual shows. 1 - clock - J P J'."""
     block.whiten()
-    taken = np.zeros(block.n)
-    for f in range(len(block.rows.factor.start)):
-        i, j = block.slices(f)
-        keys = block.keys(f)
-        if keys:
-            J = np.hstack(block.columns(f))
-            taken[i:j] = np.einsum("ij,jk,ik->i", J, cov.joint(keys), J)
+    taken = block.explained(cov)
     free = block.w > 0
     taken[free] /= block.w[free]
     clock = 0.0 if block.rows.clocks is None else block.rows.clocks.leverage(block.u)
@@ -70,7 +64,7 @@ def estimate(
     known: list[Declared],
     links: list[GnssLink],
     receivers: dict[str, Receiver],
-    cov: JointCovariance,
+    cov: Covariances,
     is_float: bool,
 ) -> tuple[list[ParameterEstimate], float]:
     """Put estimated standard deviations into the blocks' rows; returns what was found and the largest relative change.

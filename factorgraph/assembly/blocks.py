@@ -1,7 +1,7 @@
-"""Measurement blocks: whole-flight vectorised residuals and Jacobians, handed to GTSAM one factor per epoch.
+"""Measurement blocks: whole-flight vectorised residuals and Jacobians, in factors of one epoch or interval each.
 
 A block holds all rows of one source (a link's differences, a receiver's code, a set of ranges). Each iteration it
-evaluates every row at once; its `gtsam.CustomFactor`s only pick their slices. Row i of factor f reads
+evaluates every row at once; a factor is a slice of them and the variables that they see. Row i of factor f reads
 
     e_i = sqrt(w_i) / sigma_i (h_i(x) - z_i),  common clocks projected out (models.differencing)
 
@@ -15,15 +15,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import gtsam
 import numpy as np
 from numba import njit
 
+from factorgraph.assembly._point_kernels import one_way
+from factorgraph.assembly.engine import Covariances
+from factorgraph.assembly.nodes import Nodes
+from factorgraph.assembly.parameters import Parameter
+from factorgraph.assembly.variables import Point, Query, VehicleVariables
 from factorgraph.attitude import skew
-from factorgraph.graphs._point_kernels import one_way
-from factorgraph.graphs.nodes import Nodes
-from factorgraph.graphs.parameters import Parameter
-from factorgraph.graphs.variables import Point, Query, VehicleVariables
 from factorgraph.models.differencing import CommonGroups
 from factorgraph.models.robust import Loss
 from factorgraph.models.robust import cost as robust_cost
@@ -64,7 +64,7 @@ class Rows:
 
 @dataclass(slots=True)
 class Whitened:
-    """What factors hand out. They hold this alone and not their block: a circle of Python and C++ would never be freed."""
+    """What factors hand out. An engine's factors may hold this and not their block, which holds them."""
 
     e: Array = field(default_factory=lambda: np.zeros(0))  # (n,) whitened predicted - measured
     Jw: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (n, w)
@@ -81,7 +81,7 @@ class Block(ABC):
     white: Whitened = field(default_factory=Whitened, init=False)
     u: Array = field(init=False)  # (n,) sqrt(w) / sigma
     active: BoolArray = field(init=False)  # (n,) rows in use
-    made: gtsam.NonlinearFactorGraph | None = field(default=None, init=False)  # its factors, until their keys change
+    structure: int = field(default=0, init=False)  # counts changes of the factors' keys
     nodes: list[Nodes] = field(default_factory=list, init=False)  # what changes slowly and these rows see
 
     def __post_init__(self) -> None:
@@ -104,7 +104,7 @@ class Block(ABC):
 
     @abstractmethod
     def keys(self, f: int) -> list[int]:
-        """GTSAM keys of factor f, in the order of the columns."""
+        """Keys of factor f, in the order of the columns; 0 where there is a constant in place of the variable."""
 
     @abstractmethod
     def widths(self) -> tuple[int, ...]:
@@ -118,6 +118,11 @@ class Block(ABC):
     def is_stale(self) -> bool:
         """Whether the arcs that it was made for are no more."""
         return False
+
+    @property
+    def version(self) -> tuple[int, ...]:
+        """Changes when the factors' keys do."""
+        return (self.structure,)
 
     def refresh(self) -> None:  # noqa: B027 - most blocks have nothing to renew
         """Renew what depends on the preintegration bias."""
@@ -189,39 +194,37 @@ class Block(ABC):
         start = self.rows.factor.start
         return int(start[f]), int(start[f + 1]) if f + 1 < len(start) else self.n
 
-    def columns(self, f: int) -> list[Array]:
-        """Whitened Jacobians of factor f, one per key."""
+    def columns(self, f: int) -> tuple[list[int], list[Array]]:
+        """Keys of the variables of factor f and its whitened Jacobians by them."""
         i, j = self.slices(f)
-        return [self.Jw[i:j, a:b] for a, b in self.edges()]
+        used = [(k, self.Jw[i:j, a:b]) for k, (a, b) in zip(self.keys(f), self.edges(), strict=True) if k]
+        own = [k for k, _ in used], [J for _, J in used]
+        scalars = self.scalars()
+        if scalars is None:
+            return own
+        matrix = scalars.matrix(f)
+        return own[0] + scalars.of(f), own[1] + [matrix[:, k : k + 1] for k in range(matrix.shape[1])]
+
+    def scalars(self) -> ScalarColumns | None:
+        """Columns of scalar variables, of which each factor has its own number, behind those of `keys`."""
+        return None
+
+    def explained(self, cov: Covariances) -> Array:
+        """diag(J P J^T) (n,) of the whitened rows: what of their variance the solution follows. Call `whiten` before."""
+        used = [self.columns(f) for f in range(len(self.rows.factor.start))]
+        alike = len({len(keys) for keys, _ in used}) == 1 and bool(used[0][0])
+        P = (
+            cov.joints([keys for keys, _ in used])
+            if alike
+            else [cov.joint(keys) if keys else np.zeros((0, 0)) for keys, _ in used]
+        )
+        rows = [np.einsum("ij,jk,ik->i", J, P_f, J) for P_f, J in zip(P, (np.hstack(parts) for _, parts in used), strict=True)]
+        return np.concatenate(rows)
 
     def edges(self) -> list[tuple[int, int]]:
         """Column ranges of the keys."""
         ends = np.cumsum((0, *self.widths())).tolist()
         return list(itertools.pairwise(ends))
-
-    def factors(self) -> gtsam.NonlinearFactorGraph:
-        """The block's factors; made once."""
-        if self.made is None:
-            self.made = gtsam.NonlinearFactorGraph()
-            edges = self.edges()
-            for f in range(len(self.rows.factor.start)):
-                i, j = self.slices(f)
-                self.made.add(self._carrier(f, i, j, edges))
-        return self.made
-
-    def _carrier(self, f: int, i: int, j: int, edges: list[tuple[int, int]]) -> gtsam.CustomFactor:
-        """A factor that hands out rows i:j of what `whiten` computed."""
-
-        white = self.white
-
-        def error(_factor: gtsam.CustomFactor, _values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-            if jacobians is not None:
-                Jw = white.Jw[i:j]
-                for slot, (a, b) in enumerate(edges):
-                    jacobians[slot] = Jw[:, a:b]
-            return white.e[i:j]
-
-        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(j - i), self.keys(f), error)
 
 
 @dataclass(slots=True)
@@ -410,7 +413,7 @@ class EndsBlock(Block):
         if any([end.refresh() for end in self.ends()]):
             self.regroup()
             self.columns_of = Columns(self.ends(), self.parameters())
-            self.made = None
+            self.structure += 1
 
 
 @dataclass(slots=True)
@@ -494,28 +497,6 @@ class RangeBlock(EndsBlock):
 
 
 @dataclass(slots=True)
-class MotionBlock(Block):
-    """Continuous-time motion prior of a vehicle without IMU; rows are already whitened by `L`."""
-
-    vehicle: VehicleVariables
-    keys_of: Sequence[tuple[int, int, int, int]]
-    L: Array  # (K - 1, 6, 6)
-    J0: Array  # (K - 1, 6, 12)
-
-    def keys(self, f: int) -> list[int]:
-        return list(self.keys_of[f])
-
-    def widths(self) -> tuple[int, ...]:
-        return (3, 3, 3, 3)
-
-    def predict(self) -> None:
-        v = self.vehicle
-        x = np.hstack([v.r[:-1], v.v[:-1], v.r[1:], v.v[1:]])
-        self.y = -np.einsum("nij,njk,nk->ni", self.L, self.J0, x).ravel()
-        self.J = (self.L @ self.J0).reshape(self.n, 12)
-
-
-@dataclass(slots=True)
 class JointBlock(Block):
     """One empty row per state: no information, only joint elimination of several vehicles' poses and velocities."""
 
@@ -547,8 +528,12 @@ class ScalarColumns:
     first: IntArray  # (factors + 1,) into dense
     dense: Array
 
+    def of(self, f: int) -> list[int]:
+        """Keys of factor f."""
+        return [int(k) for k in self.keys[self.first_key[f] : self.first_key[f + 1]]]
+
     @classmethod
-    def of(cls, row: IntArray, key: IntArray, scale: Array, factor: CommonGroups, n: int) -> ScalarColumns:
+    def sorted(cls, row: IntArray, key: IntArray, scale: Array, factor: CommonGroups, n: int) -> ScalarColumns:
         start = np.concatenate([factor.start, [n]]).astype(np.int64)
         order = np.lexsort((key, factor.of_row[row])) if len(row) else np.zeros(0, np.int64)
         f, k = factor.of_row[row][order], key[order]
@@ -654,25 +639,21 @@ class GnssBlock(EndsBlock):
         return self.biases
 
     def keys(self, f: int) -> list[int]:
-        return [*self.columns_of.keys(f), *self.scalars(f)]
+        return self.columns_of.keys(f)
 
     def regroup(self) -> None:
         """A factor per epoch, whatever its states; two antennas of one vehicle are seen from the same state."""
         if self.reference is not None:
             share_states(self.rover, self.reference)
 
-    def scalars(self, f: int) -> list[int]:
-        """Keys of the ambiguities and nodes of factor f that are variables."""
-        c = self._entries()
-        return [int(k) for k in c.keys[c.first_key[f] : c.first_key[f + 1]]]
-
     def sightings(self) -> tuple[IntArray, Array]:
         """Keys (m,) of ambiguities and nodes that are variables, and the times at which factors have them."""
-        c = self._entries()
+        c = self.scalars()
         t_s = self.rows.t_s[self.rows.factor.start]
         return c.keys, np.repeat(t_s, np.diff(c.first_key))
 
-    def _entries(self) -> ScalarColumns:
+    def scalars(self) -> ScalarColumns:
+        """Columns of the ambiguities and nodes that are variables."""
         if self.scalar_columns is None:
             arc_free = self.arc >= 0
             arc_free[arc_free] = self.amb_key[self.arc[arc_free]] != 0
@@ -680,7 +661,7 @@ class GnssBlock(EndsBlock):
             row = np.concatenate([a, *(nodes.row for nodes in self.nodes)])
             key = np.concatenate([self.amb_key[self.arc[a]], *(nodes.key[nodes.node] for nodes in self.nodes)])
             scale = np.concatenate([self.unit_m(a), *(nodes.scale for nodes in self.nodes)])
-            self.scalar_columns = ScalarColumns.of(row, key, scale, self.rows.factor, self.n)
+            self.scalar_columns = ScalarColumns.sorted(row, key, scale, self.rows.factor, self.n)
         return self.scalar_columns
 
     def unit_m(self, phases: IntArray) -> Array:
@@ -690,35 +671,14 @@ class GnssBlock(EndsBlock):
     def renew(self) -> None:
         """Call when ambiguities became constants or variables: the factors' keys change with them."""
         self.scalar_columns = None
-        self.made = None
+        self.structure += 1
 
     def whiten(self) -> None:
         Block.whiten(self)
-        c = self._entries()
+        c = self.scalars()
         if len(c.row):
             assert self.rows.clocks is not None
             project_entries(c, self.u, self.rows.clocks, self.rows.factor)
-
-    def _carrier(self, f: int, i: int, j: int, edges: list[tuple[int, int]]) -> gtsam.CustomFactor:
-        c = self._entries()
-        width = int(c.first_key[f + 1] - c.first_key[f])
-        if not width:
-            return Block._carrier(self, f, i, j, edges)
-        own = len(edges)
-        matrix = c.matrix(f)
-
-        white = self.white
-
-        def error(_factor: gtsam.CustomFactor, _values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-            if jacobians is not None:
-                Jw = white.Jw[i:j]
-                for slot, (a, b) in enumerate(edges):
-                    jacobians[slot] = Jw[:, a:b]
-                for k in range(width):
-                    jacobians[own + k] = matrix[:, k : k + 1]
-            return white.e[i:j]
-
-        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(j - i), self.keys(f), error)
 
     def predict(self) -> None:
         has_rate = bool(np.any(self.rows.kind == DOPPLER))
@@ -753,7 +713,3 @@ class GnssBlock(EndsBlock):
 
     def _jacobian(self, by_r: Array, e: Array, point: Point) -> Array:
         return np.asarray(_point_jacobians(self.point_rover, by_r, self.rows.kind == DOPPLER, -e, point.J_r, point.J_v))
-
-    def columns(self, f: int) -> list[Array]:
-        matrix = self._entries().matrix(f)
-        return [*Block.columns(self, f), *(matrix[:, k : k + 1] for k in range(matrix.shape[1]))]

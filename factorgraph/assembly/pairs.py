@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph.assembly.engine import Covariances
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.attitude import matrix_from_quat, skew
-from factorgraph.graphs.covariance import JointCovariance
-from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.problem import Link, NavigationProblem, Vehicle
 from factorgraph.start import interpolate
 from factorgraph.types import Array
@@ -88,7 +88,7 @@ def _lever(v: Vehicle, is_antenna: bool) -> Array:
     return np.asarray(v.gnss.lever_b, float)
 
 
-def pair_covariance(problem: NavigationProblem, pair: tuple[PairEnd, PairEnd], cov: JointCovariance) -> Array:
+def pair_covariance(problem: NavigationProblem, pair: tuple[PairEnd, PairEnd], cov: Covariances) -> Array:
     """Covariance (K, 6, 6) of rover relative to reference, position and velocity, east-north-up at the reference."""
     a, b = pair
     C = problem.frame.C_to_enu(a.motion()[0])

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from factorgraph.graphs.blocks import Block
-from factorgraph.graphs.parameters import Parameter, Parameters
-from factorgraph.graphs.rows import plain_rows
-from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.assembly.blocks import Block
+from factorgraph.assembly.parameters import Parameter, Parameters
+from factorgraph.assembly.rows import interval_rows
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.models.imu_interval import STATE, Intervals, States, WhiteNoise, evaluate, preintegrate
 from factorgraph.models.preintegration import crossing, grouped_inputs
 from factorgraph.models.robust import Loss
@@ -97,13 +97,5 @@ def imu_block(vehicle: VehicleVariables, parameters: Parameters) -> ImuBlock | N
     kept: IntArray | slice = slice(None)
     if any(used) and not all(used):
         kept = np.concatenate([np.arange(2 * STATE), 2 * STATE + np.flatnonzero(np.repeat(used, 3))])
-    rows = plain_rows(
-        -1,
-        np.repeat(vehicle.t_s[1:], 15),
-        np.ones(15 * n),
-        np.repeat(np.arange(n), 15),
-        vehicle.name,
-        ["imu"],
-        np.zeros(15 * n, np.int64),
-    )
+    rows = interval_rows(vehicle.t_s, 15, vehicle.name, "imu")
     return ImuBlock(rows, vehicle=vehicle, scales=tuple(p for p in (accel, gyro) if p is not None), kept=kept)

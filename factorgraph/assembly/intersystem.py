@@ -14,8 +14,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from factorgraph.graphs.blocks import CODE, DOPPLER, KINDS, PHASE, GnssBlock
-from factorgraph.graphs.parameters import Parameter, Parameters
+from factorgraph.assembly.blocks import CODE, DOPPLER, KINDS, PHASE, GnssBlock
+from factorgraph.assembly.parameters import Parameter, Parameters
 from factorgraph.types import Array, IntArray
 
 PRIOR_M = 1000.0  # of a bias: a few microseconds

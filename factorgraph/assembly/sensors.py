@@ -21,12 +21,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from factorgraph.assembly.blocks import ATTITUDE, BEARING, MAGNETIC, VELOCITY, Block, Endpoint, EndsBlock, Rows
+from factorgraph.assembly.parameters import Parameter, Parameters
+from factorgraph.assembly.rows import in_grid, plain_rows, sensor_end
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.attitude import exp_so3, log_so3, matrix_from_quat, right_jacobian, right_jacobian_inverse, skew
 from factorgraph.errors import InputError
-from factorgraph.graphs.blocks import ATTITUDE, BEARING, MAGNETIC, VELOCITY, Block, Endpoint, EndsBlock, Rows
-from factorgraph.graphs.parameters import Parameter, Parameters
-from factorgraph.graphs.rows import in_grid, plain_rows, sensor_end
-from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.measurements import (
     AttitudeStream,
     Calibration,

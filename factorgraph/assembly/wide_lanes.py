@@ -14,15 +14,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
 from ambiguity import partial
-from factorgraph.graphs.blocks import CODE, PHASE, Block, GnssBlock
-from factorgraph.graphs.build import GnssLink
-from factorgraph.graphs.covariance import covariance_of
-from factorgraph.graphs.optimizer import Graph
-from factorgraph.graphs.rows import plain_rows
+from factorgraph.assembly.blocks import CODE, PHASE, Block, GnssBlock
+from factorgraph.assembly.build import GnssLink
+from factorgraph.assembly.engine import Eliminated
+from factorgraph.assembly.optimizer import Graph
+from factorgraph.assembly.rows import plain_rows
 from factorgraph.models.combinations import melbourne_wuebbena
 from factorgraph.problem import AmbiguitySettings
 from factorgraph.types import Array, BoolArray, IntArray
@@ -48,12 +47,17 @@ class WideLaneBlock(Block):
         return self.valid_for is not self.of.amb_key
 
     @property
+    def version(self) -> tuple[int, ...]:
+        return (self.of.structure, int(self.active.sum()))
+
+    @property
     def pairs(self) -> list[tuple[int, int]]:
         return list(zip(self.first.tolist(), self.second.tolist(), strict=True))
 
     def keys(self, f: int) -> list[int]:
-        """Of those of the two that are variables."""
-        return [int(k) for k in (self.of.amb_key[self.first[f]], self.of.amb_key[self.second[f]]) if k]
+        if not self.active[f]:
+            return [0, 0]
+        return [int(self.of.amb_key[self.first[f]]), int(self.of.amb_key[self.second[f]])]
 
     def widths(self) -> tuple[int, ...]:
         return (1, 1)
@@ -62,35 +66,21 @@ class WideLaneBlock(Block):
         self.y = self.integer - (self.of.amb_value[self.first] - self.of.amb_value[self.second])
         self.J = np.tile([1.0, -1.0], (self.n, 1))
 
-    def columns(self, f: int) -> list[Array]:
-        both = Block.columns(self, f)
-        return [c for c, k in zip(both, (self.of.amb_key[self.first[f]], self.of.amb_key[self.second[f]]), strict=True) if k]
 
-    def factors(self) -> gtsam.NonlinearFactorGraph:
-        """Made anew each time: ambiguities become constants and variables again."""
-        made = gtsam.NonlinearFactorGraph()
-        for f in range(self.n):
-            free = [bool(self.of.amb_key[arc[f]]) for arc in (self.first, self.second)]
-            if self.active[f] and any(free):
-                edges = [edge for edge, is_free in zip(((0, 1), (1, 2)), free, strict=True) if is_free]
-                made.add(self._carrier(f, f, f + 1, edges))
-        return made
-
-
-def hold(graph: Graph, links: list[GnssLink], net: gtsam.GaussianBayesNet, settings: AmbiguitySettings) -> int:
+def hold(graph: Graph, links: list[GnssLink], eliminated: Eliminated, settings: AmbiguitySettings) -> int:
     """Hold the wide lanes that can be fixed and are not held yet; returns how many."""
     held = 0
     for data in links:
         block = data.block
         pairs = open_pairs(data, {p for b in graph.blocks if isinstance(b, WideLaneBlock) and b.of is block for p in b.pairs})
-        known = np.array([not k or graph.values.exists(int(k)) for k in block.amb_key], bool)
+        known = np.array([not k or int(k) in graph.ambiguities for k in block.amb_key], bool)
         pairs = pairs[np.all(known[pairs], axis=1)]
         if not len(pairs):
             continue
         arcs = np.unique(pairs)
         free = arcs[block.amb_key[arcs] != 0]
         Z = (pairs[:, :1] == free).astype(float) - (pairs[:, 1:] == free)
-        Q = Z @ covariance_of(net, block.amb_key[free].tolist()) @ Z.T
+        Q = Z @ eliminated.covariance(block.amb_key[free].tolist()) @ Z.T
         value = block.amb_value[pairs[:, 0]] - block.amb_value[pairs[:, 1]]
         limits = (settings.ratio_threshold, settings.min_success_rate)
         got = partial.fix_ordered(value, 0.5 * (Q + Q.T), -np.diag(Q), *limits)  # the least precise are left out first

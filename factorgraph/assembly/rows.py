@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgraph.graphs.blocks import Endpoint, Offset, Rows
-from factorgraph.graphs.parameters import Parameter, Parameters
-from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.assembly.blocks import Endpoint, Offset, Rows
+from factorgraph.assembly.parameters import Parameter, Parameters
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.measurements import Calibration
 from factorgraph.models.differencing import CommonGroups
 from factorgraph.problem import Vec3
@@ -31,6 +31,13 @@ def plain_rows(kind: int, t: Array, sigma: Array, factor: IntArray, source: str,
         nothing,
         nothing,
     )
+
+
+def interval_rows(t_s: Array, d: int, source: str, label: str) -> Rows:
+    """d whitened rows for each interval between times (K,), a factor each."""
+    n = len(t_s) - 1
+    factor = np.repeat(np.arange(n), d)
+    return plain_rows(-1, np.repeat(t_s[1:], d), np.ones(d * n), factor, source, [label], np.zeros(d * n, np.int64))
 
 
 def in_grid(t: Array, grid: Array, time_sigma_s: float = 0.0) -> BoolArray:

@@ -6,12 +6,11 @@ the smoothed one, by an IMU where there is one, afterwards. Whenever arcs change
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 
-from factorgraph.graphs.build import GnssLink, describe_arcs
-from factorgraph.graphs.covariance import covariance_of
-from factorgraph.graphs.integers import connected_arcs, start_ambiguities
+from factorgraph.assembly.build import GnssLink, describe_arcs
+from factorgraph.assembly.engine import Eliminated
+from factorgraph.assembly.integers import connected_arcs, start_ambiguities
 from factorgraph.models.arcs import CAUSES, PREDICTION, RESIDUAL_STEP, split_at_steps
 from factorgraph.models.slips import Phases, Repaired, Steps, find_steps, repair, whole_cycles
 from factorgraph.problem import AmbiguitySettings
@@ -105,7 +104,7 @@ def _renew(data: GnssLink, rows: IntArray, arc: IntArray, jump_cyc: Array, setti
     start_ambiguities(data)
 
 
-def open_halves(links: list[GnssLink], net: gtsam.GaussianBayesNet, settings: AmbiguitySettings) -> int:
+def open_halves(links: list[GnssLink], eliminated: Eliminated, settings: AmbiguitySettings) -> int:
     """Let arcs be multiples of half a cycle that float ambiguities show to be half a cycle apart from their satellite's next.
 
     Half a cycle was lost between them unannounced, and nothing tells on which side; returns how many arcs.
@@ -123,7 +122,7 @@ def open_halves(links: list[GnssLink], net: gtsam.GaussianBayesNet, settings: Am
         near = (series[i] == series[j]) & (component[i] == component[j])
         near &= (block.amb_unit_cyc[i] == 1.0) & (block.amb_unit_cyc[j] == 1.0)
         near &= np.abs(np.abs(block.amb_value[j] - block.amb_value[i]) % 1 - 0.5) < 0.25
-        odd = {int(arc) for pair in zip(i[near], j[near], strict=True) if _is_half_apart(data, pair, net) for arc in pair}
+        odd = {int(arc) for pair in zip(i[near], j[near], strict=True) if _is_half_apart(data, pair, eliminated) for arc in pair}
         if odd:
             data.odd |= np.isin(block.arc, list(odd))
             _renew(data, rows, block.arc[rows], block.jump_cyc[rows], settings)
@@ -131,12 +130,12 @@ def open_halves(links: list[GnssLink], net: gtsam.GaussianBayesNet, settings: Am
     return opened
 
 
-def _is_half_apart(data: GnssLink, pair: tuple[int, int], net: gtsam.GaussianBayesNet) -> bool:
+def _is_half_apart(data: GnssLink, pair: tuple[int, int], eliminated: Eliminated) -> bool:
     """Whether the difference of two float ambiguities agrees with half a cycle and with no whole one."""
     block = data.block
     free = [int(block.amb_key[arc]) for arc in pair if block.amb_key[arc] != 0]
     sign = np.array([s for s, arc in zip((-1.0, 1.0), pair, strict=True) if block.amb_key[arc] != 0])
-    sigma = float(np.sqrt(sign @ covariance_of(net, free) @ sign))
+    sigma = float(np.sqrt(sign @ eliminated.covariance(free) @ sign))
     off = abs(abs(float(block.amb_value[pair[1]] - block.amb_value[pair[0]])) % 1 - 0.5)
     return off < HALF_SIGMA * sigma < 0.5 - off
 

@@ -1,6 +1,6 @@
 """Heights whose bias walks, as a barometer's does with the weather: z = r_U + (1 - f) b_j + f b_{j+1}.
 
-The bias has nodes (`graphs.nodes`) so close that it walks by no more than half of a measurement's standard deviation from one
+The bias has nodes (`assembly.nodes`) so close that it walks by no more than half of a measurement's standard deviation from one
 to the next. A factor holds the heights of one state interval between two nodes.
 """
 
@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
-from factorgraph.graphs.atmosphere import NodeBlock, node_block
-from factorgraph.graphs.blocks import HEIGHT, Endpoint, EndsBlock
-from factorgraph.graphs.nodes import LETTER, Nodes, Process
-from factorgraph.graphs.parameters import Parameters
-from factorgraph.graphs.rows import plain_rows, sensor_end
-from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.assembly.atmosphere import NodeBlock, node_block
+from factorgraph.assembly.blocks import HEIGHT, Endpoint, EndsBlock
+from factorgraph.assembly.keys import symbol
+from factorgraph.assembly.nodes import LETTER, Nodes, Process
+from factorgraph.assembly.parameters import Parameters
+from factorgraph.assembly.rows import plain_rows, sensor_end
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.measurements import HeightStream
 from factorgraph.models.differencing import CommonGroups
 from factorgraph.types import Array, BoolArray, IntArray
@@ -66,7 +66,7 @@ def barometer_blocks(
     node = np.floor(place).astype(np.int64)
     n = int(node[-1]) + 2
     first = FIRST_KEY + (end.index * STREAMS_PER_VEHICLE + index) * KEYS_PER_STREAM
-    keys = np.array([gtsam.symbol(LETTER, first + i) for i in range(n)], np.int64)
+    keys = np.array([symbol(LETTER, first + i) for i in range(n)], np.int64)
     row, late = np.arange(len(t)), place - node
     nodes = Nodes(
         "bias",

@@ -1,6 +1,6 @@
 """Constants that the flight estimates beside its states: biases, scales, lever arms, mountings, time offsets.
 
-A parameter is one variable of the graph with a Gaussian prior, eliminated after all states. Its key's letter says its
+A parameter is one variable with a Gaussian prior, eliminated after all states. Its key's letter says its
 dimension: `c` 1, `l` 3.
 """
 
@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-import gtsam
 import numpy as np
 
+from factorgraph.assembly.keys import symbol
 from factorgraph.types import Array
 
 LETTERS = {1: "c", 3: "l"}
@@ -40,7 +40,7 @@ class Parameters:
         """The parameter of that name; made where there is none yet. prior, sigma (d,), d 1 or 3."""
         if name not in self.of_name:
             prior, sigma = np.atleast_1d(np.asarray(prior, float)), np.atleast_1d(np.asarray(sigma, float))
-            key = int(gtsam.symbol(LETTERS[len(prior)], len(self.of_name)))
+            key = symbol(LETTERS[len(prior)], len(self.of_name))
             self.of_name[name] = Parameter(key, name, components, unit, prior, sigma, prior.copy())
         return self.of_name[name]
 
@@ -58,10 +58,3 @@ class Parameters:
     def offsets_s(self) -> Array:
         """Current time offsets (m,)."""
         return np.array([p.value[0] for p in self.of_name.values() if p.unit == "s"])
-
-    def priors(self) -> gtsam.NonlinearFactorGraph:
-        """One prior factor per parameter."""
-        graph = gtsam.NonlinearFactorGraph()
-        for p in self.of_name.values():
-            graph.add(gtsam.PriorFactorVector(p.key, p.prior, gtsam.noiseModel.Diagonal.Sigmas(p.sigma)))
-        return graph

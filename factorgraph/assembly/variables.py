@@ -1,6 +1,6 @@
-"""Variables of the graph: every vehicle's pose, velocity and bias on one time grid, and points observed from them.
+"""Variables of a problem: every vehicle's pose, velocity and bias on one time grid, and points observed from them.
 
-Keys: `x` Pose3 (body to n), `v` velocity in n, `b` bias (accelerometer, gyroscope as GTSAM orders them); a vehicle
+Keys: `x` pose (body to n), `v` velocity in n, `b` bias (accelerometer, gyroscope); a vehicle
 without an IMU has `p` (position of its antenna in n) instead of `x` and no bias; a base station has no variables.
 `a` are ambiguities in cycles, `s` range bias and scale.
 
@@ -9,21 +9,22 @@ A point observed at time t belongs to the latest state at or before it and is ca
     R_t = Exp(-w_ie dt) R_k dR,   v_t = v_k + (g - 2 w_ie x v_k) dt + R_k dv,
     r_t = r_k + v_k dt + (g - 2 w_ie x v_k) dt^2 / 2 + R_k dp,   a = r_t + R_t l,   v_a = v_t + R_t (w_nb x l)
 
-Perturbation as GTSAM's Pose3: R Exp(dtheta), r + R drho.
+Perturbation of a pose: R Exp(dtheta), r + R drho.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import gtsam
 import numpy as np
 
+from factorgraph.assembly._point_kernels import carried_points
+from factorgraph.assembly.keys import symbol
+from factorgraph.assembly.parameters import Parameter
 from factorgraph.attitude import exp_so3, right_jacobian, skew
 from factorgraph.geodesy import LocalFrame, centrifugal_ecef
-from factorgraph.graphs._point_kernels import carried_points
-from factorgraph.graphs.parameters import Parameter
 from factorgraph.grid import MERGE_S
 from factorgraph.measurements import ImuStream
 from factorgraph.models import preintegration
@@ -37,8 +38,8 @@ _STRIDE = 10_000_000
 
 
 def key(letter: str, vehicle: int, k: int) -> int:
-    """GTSAM key of a vehicle's variable at grid time k."""
-    return int(gtsam.symbol(letter, vehicle * _STRIDE + k))
+    """Key of a vehicle's variable at grid time k."""
+    return symbol(letter, vehicle * _STRIDE + k)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,28 +68,13 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True)
-class ValueTable:
-    """Poses, positions and velocities of all vehicles as GTSAM hands them out: sorted by vehicle, then state."""
+class Trajectory:
+    """The values of a vehicle's variables."""
 
-    poses: Array  # (n, 12) rotation row by row, translation
-    positions: Array  # (n, 3)
-    velocities: Array  # (n, 3)
-    first: dict[int, int]  # vehicle -> first row of its velocities
-    first_pose: dict[int, int]
-    first_position: dict[int, int]
-
-    @classmethod
-    def of(cls, values: gtsam.Values, vehicles: list[VehicleVariables]) -> ValueTable:
-        starts: dict[str, dict[int, int]] = {}
-        for mode, kinds in (("any", ("imu", "motion")), ("imu", ("imu",)), ("motion", ("motion",))):
-            at = 0
-            starts[mode] = {}
-            for v in sorted(vehicles, key=lambda v: v.index):
-                starts[mode][v.index] = at
-                at += len(v.t_s) if v.mode in kinds else 0
-        extract = gtsam.utilities.extractVectors
-        poses = gtsam.utilities.extractPose3(values)
-        return cls(poses, extract(values, "p"), extract(values, "v"), starts["any"], starts["imu"], starts["motion"])
+    r: Array  # (K, 3)
+    v: Array  # (K, 3)
+    R: Array  # (K, 3, 3)
+    bias: Array  # (K, 6) gyroscope, accelerometer
 
 
 class VehicleVariables:
@@ -274,30 +260,27 @@ class VehicleVariables:
         f_b = self.imu.f_b[i] - self.bias[q.k, 3:]
         return np.asarray(np.einsum("nij,nj->ni", p.R, f_b) + self.gravity_terms(q.k))
 
-    def insert(self, values: gtsam.Values) -> None:
-        """Put the current trajectory into GTSAM values."""
-        for k in range(len(self.t_s)):
-            if self.mode == "imu":
-                values.insert(key("x", self.index, k), gtsam.Pose3(gtsam.Rot3(self.R[k]), self.r[k]))
-                values.insert(key("b", self.index, k), gtsam.imuBias.ConstantBias(self.bias[k, 3:], self.bias[k, :3]))
-            elif self.mode == "motion":
-                values.insert(key("p", self.index, k), self.r[k])
-            if self.mode != "fixed":
-                values.insert(key("v", self.index, k), self.v[k])
+    @property
+    def trajectory(self) -> Trajectory:
+        return Trajectory(self.r, self.v, self.R, self.bias)
 
-    def extract(self, values: gtsam.Values, table: ValueTable) -> None:
-        """Take the trajectory from GTSAM values."""
-        rows = slice(table.first[self.index], table.first[self.index] + len(self.t_s))
-        if self.mode != "fixed":
-            self.v = table.velocities[rows].copy()
-        if self.mode == "imu":
-            poses = table.poses[table.first_pose[self.index] :][: len(self.t_s)]
-            self.R, self.r = poses[:, :9].reshape(-1, 3, 3).copy(), poses[:, 9:].copy()
-            bias = np.array([values.atConstantBias(keys[2]).vector() for keys in self._keys])
-            self.bias = np.hstack([bias[:, 3:], bias[:, :3]])
-        elif self.mode == "motion":
-            self.r = table.positions[table.first_position[self.index] :][: len(self.t_s)].copy()
+    @trajectory.setter
+    def trajectory(self, values: Trajectory) -> None:
+        self.r, self.v, self.R, self.bias = values.r, values.v, values.R, values.bias
+
+    def retract(self, step: Callable[[Sequence[int]], Array]) -> None:
+        """Move all states by a step, which gives the components (K, d) of variables by their keys."""
+        if self.mode == "fixed":
+            return
+        pose, velocity, *bias = (step([keys[i] for keys in self._keys]) for i in range(len(self.dims)))
+        self.v = self.v + velocity
+        if self.mode == "motion":
+            self.r = self.r + pose
+            return
+        self.r = self.r + np.einsum("kij,kj->ki", self.R, pose[:, 3:])
+        self.R = self.R @ exp_so3(pose[:, :3])
+        self.bias = self.bias + np.hstack([bias[0][:, 3:], bias[0][:, :3]])
 
     def origin_centrifugal(self) -> Array:
-        """Centrifugal acceleration at the frame's origin (3,), which GTSAM's Coriolis term leaves out."""
+        """Centrifugal acceleration at the frame's origin (3,), which the Earth rate leaves out."""
         return self.frame.rotate_from_ecef(centrifugal_ecef(self.frame.origin_ecef))

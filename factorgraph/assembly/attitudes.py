@@ -7,18 +7,20 @@ the start whose cost is least is kept.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from factorgraph import alignment
 from factorgraph.alignment import ALTERNATIVE, APART_RAD, HEADINGS, Alignment, Directions, align
+from factorgraph.assembly import integers
+from factorgraph.assembly.build import build
+from factorgraph.assembly.engine import Engine
+from factorgraph.assembly.optimizer import optimise
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.attitude import exp_so3, log_so3, matrix_from_quat
 from factorgraph.errors import InputError
-from factorgraph.graphs import integers
-from factorgraph.graphs.build import build
-from factorgraph.graphs.optimizer import optimise
-from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.measurements import AttitudeStream, MagneticStream, PositionStream
 from factorgraph.models.compass import antenna_line
 from factorgraph.models.receivers import Receiver
@@ -40,6 +42,7 @@ def start_attitudes(
     vehicles: list[VehicleVariables],
     rough: list[VehicleVariables],
     rx: dict[str, Receiver],
+    engine: Callable[[], Engine],
 ) -> list[str]:
     """Attitudes and biases into vehicles that already have positions and velocities of their antennas; returns notes.
 
@@ -51,7 +54,7 @@ def start_attitudes(
             continue
         found = _aligned(v, (*directions_of(v.vehicle), *_antenna_lines(problem, v, rx)))
         if not found.is_decided:
-            found = _compared(problem, v, rough, rx, found)
+            found = _compared(problem, v, rough, rx, engine, found)
         v.attitude_prior = found.prior
         v.R, v.bias = found.C_nb, found.bias
         notes.append(f"{v.name}: {_told(found)}")
@@ -172,7 +175,12 @@ class _Tried:
 
 
 def _compared(
-    problem: NavigationProblem, v: VehicleVariables, rough: list[VehicleVariables], rx: dict[str, Receiver], found: Alignment
+    problem: NavigationProblem,
+    v: VehicleVariables,
+    rough: list[VehicleVariables],
+    rx: dict[str, Receiver],
+    engine: Callable[[], Engine],
+    found: Alignment,
 ) -> Alignment:
     """The alignment turned to the best of several headings, if one stands out."""
     rows = _liveliest(v)
@@ -181,7 +189,7 @@ def _compared(
     if len(rows) < 3 or np.mean(inside(spans, t, t)) > RESTING:
         return found
     try:
-        tried = _tried(problem, v, rough, rx, found, rows)
+        tried = _tried(problem, v, rough, rx, engine, found, rows)
     except InputError:  # receivers of a link that share nothing in just this piece
         return found
     best = tried[0]
@@ -213,6 +221,7 @@ def _tried(
     v: VehicleVariables,
     rough: list[VehicleVariables],
     rx: dict[str, Receiver],
+    engine: Callable[[], Engine],
     found: Alignment,
     rows: IntArray,
 ) -> list[_Tried]:
@@ -224,7 +233,7 @@ def _tried(
         own = next(part for part in parts if part.index == v.index)
         own.R, own.bias = found.turned(heading)[rows], found.bias[rows]
         own.attitude_prior = (own.R[0], alignment.WIDEST_RAD)
-        built = build(piece, parts, rx, use_phase=True)
+        built = build(piece, parts, rx, use_phase=True, engine=engine())
         for data in built.links:
             integers.start_ambiguities(data)
         built.graph.assemble()

@@ -17,13 +17,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph.assembly.blocks import CONSTRAINT, Block, Endpoint
+from factorgraph.assembly.parameters import Parameters
+from factorgraph.assembly.rows import plain_rows
+from factorgraph.assembly.sensors import AXES_B, AXES_N, Measured, Model, Mounting, VectorBlock, body_velocity, known
+from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.attitude import log_so3, right_jacobian_inverse
 from factorgraph.errors import InputError
-from factorgraph.graphs.blocks import CONSTRAINT, Block, Endpoint
-from factorgraph.graphs.parameters import Parameters
-from factorgraph.graphs.rows import plain_rows
-from factorgraph.graphs.sensors import AXES_B, AXES_N, Measured, Model, Mounting, VectorBlock, body_velocity, known
-from factorgraph.graphs.variables import VehicleVariables
 from factorgraph.problem import NavigationProblem, Vehicle
 from factorgraph.rest import inside, rest_spans, union, zero_spans
 from factorgraph.types import Array, BoolArray, IntArray

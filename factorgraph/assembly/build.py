@@ -1,4 +1,4 @@
-"""From a navigation problem to a graph: receivers prepared, rows sorted into blocks, factors between states.
+"""From a navigation problem to blocks: receivers prepared, rows sorted into blocks, factors between states.
 
 The absolute code of a rover is not used where its link's reference has absolute information of its own: undifferenced
 code of the reference and differences carry everything once.
@@ -6,16 +6,14 @@ code of the reference and differences carry everything once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
-import gtsam
 import numpy as np
 
-from factorgraph.errors import InputError
-from factorgraph.graphs.atmosphere import absolute_codes, link_atmosphere, receiver_atmosphere
-from factorgraph.graphs.barometer import barometer_blocks
-from factorgraph.graphs.blocks import (
+from factorgraph.assembly.atmosphere import absolute_codes, link_atmosphere, receiver_atmosphere
+from factorgraph.assembly.barometer import barometer_blocks
+from factorgraph.assembly.blocks import (
     CODE,
     DOPPLER,
     HEIGHT,
@@ -27,21 +25,23 @@ from factorgraph.graphs.blocks import (
     GnssBlock,
     HeightBlock,
     JointBlock,
-    MotionBlock,
     Offset,
     PositionBlock,
     RangeBlock,
     Rows,
 )
-from factorgraph.graphs.constraints import constraint_blocks
-from factorgraph.graphs.inertial import add_priors, motion_keys, motion_prior_rows
-from factorgraph.graphs.inertial_block import imu_block
-from factorgraph.graphs.intersystem import biases, shared_clocks, start_biases
-from factorgraph.graphs.optimizer import Graph
-from factorgraph.graphs.parameters import Parameters
-from factorgraph.graphs.rows import in_grid, plain_rows, sensor_end, time_offset
-from factorgraph.graphs.sensors import sensor_blocks
-from factorgraph.graphs.variables import VehicleVariables
+from factorgraph.assembly.constraints import constraint_blocks
+from factorgraph.assembly.engine import Engine
+from factorgraph.assembly.inertial_block import imu_block
+from factorgraph.assembly.intersystem import biases, shared_clocks, start_biases
+from factorgraph.assembly.keys import symbol
+from factorgraph.assembly.optimizer import Graph
+from factorgraph.assembly.parameters import Parameters
+from factorgraph.assembly.priors import motion_block, parameter_priors, state_prior
+from factorgraph.assembly.rows import in_grid, plain_rows, sensor_end, time_offset
+from factorgraph.assembly.sensors import sensor_blocks
+from factorgraph.assembly.variables import VehicleVariables
+from factorgraph.errors import InputError
 from factorgraph.measurements import Tag
 from factorgraph.models.arcs import Arcs, find_arcs
 from factorgraph.models.differencing import CommonGroups
@@ -86,7 +86,7 @@ class GnssLink:
 
     def make_free(self, arc: int) -> None:
         """Give an arc its variable back."""
-        self.block.amb_key[arc] = int(gtsam.symbol("a", self.key_base + arc))
+        self.block.amb_key[arc] = symbol("a", self.key_base + arc)
 
 
 def _gnss_rows(
@@ -286,7 +286,7 @@ def describe_arcs(data: GnssLink) -> None:
     data.arc_satellite = [block.rows.label[i] for i in block.rows.label_index[first]]
     data.arc_signal = [block.rows.group[g] for g in data.arc_group]
     data.arc_start_s, data.arc_end_s = block.rows.t_s[first], block.rows.t_s[last]
-    block.amb_key = np.array([gtsam.symbol("a", data.key_base + i) for i in range(n)], np.int64)
+    block.amb_key = np.array([symbol("a", data.key_base + i) for i in range(n)], np.int64)
     block.amb_value, block.amb_unit_cyc = np.zeros(n), np.ones(n)
     data.state, data.float_cyc, data.float_sigma = ["float"] * n, np.zeros(0), np.zeros(0)
 
@@ -454,21 +454,6 @@ def _ranged(
     return Endpoint(end, end.query(t, lever), lever_of, [replace(o) for o in offset])
 
 
-def motion_block(vehicle: VehicleVariables) -> MotionBlock:
-    L, J = motion_prior_rows(vehicle)
-    n = len(L)
-    rows = plain_rows(
-        -1,
-        np.repeat(vehicle.t_s[1:], 6),
-        np.ones(6 * n),
-        np.repeat(np.arange(n), 6),
-        vehicle.name,
-        ["motion"],
-        np.zeros(6 * n, np.int64),
-    )
-    return MotionBlock(rows, vehicle=vehicle, keys_of=[motion_keys(vehicle, k) for k in range(n)], L=L, J0=J)
-
-
 def joint_blocks(pairs: Iterable[tuple[VehicleVariables, VehicleVariables]]) -> list[JointBlock]:
     """Rows without information that keep the states of one time in one clique, so that the covariance of pairs is at hand.
 
@@ -500,26 +485,17 @@ class Built:
     noise: list[ParameterEstimate] = field(default_factory=list)  # found from residuals
 
 
-def native_factors(graph: Graph) -> None:
-    """(Re)build the native factors, priors of states and parameters; IMUs are preintegrated at the current biases from now on."""
-    graph.native = gtsam.NonlinearFactorGraph()
-    for v in graph.vehicles:
-        v.preintegrated_bias = v.bias.copy()
-        add_priors(graph.native, v)
-    graph.native.push_back(graph.parameters.priors())
-
-
 def build(
     problem: NavigationProblem,
     vehicles: list[VehicleVariables],
     rx: dict[str, Receiver],
     use_phase: bool,
-    progress: Callable[[float], None] = lambda f: None,
+    engine: Engine,
 ) -> Built:
-    """All blocks and native factors for variables that already hold start values."""
+    """All blocks for variables that already hold start values."""
     ends = {v.name: v for v in vehicles}
     antennas = ends | {v.name: ends[v.carrier] for v in problem.vehicles if v.carrier is not None}
-    graph = Graph(vehicles, [], gtsam.NonlinearFactorGraph())
+    graph = Graph(vehicles, engine)
     for end in vehicles:
         end.preintegrated_bias = end.bias.copy()
         if end.mode == "imu":
@@ -558,8 +534,6 @@ def build(
     others += sensor_blocks(problem, ends, graph.parameters)
     others += constraint_blocks(problem, ends, graph.parameters)
     graph.joints += joint_blocks((antennas[p.reference], antennas[p.rover]) for p in problem.wanted_pairs)
-    graph.blocks = [*graph.gnss, *absolute, *others]
-    progress(0.5)
-    native_factors(graph)
-    progress(1.0)
+    starts = [prior for end in vehicles if (prior := state_prior(end)) is not None]
+    graph.blocks = [*graph.gnss, *absolute, *others, *starts, *parameter_priors(graph.parameters)]
     return Built(graph, links, rx, antennas)
