@@ -38,6 +38,13 @@ def _all_times(problem: NavigationProblem, vehicle: Vehicle) -> Array:
     return np.concatenate(times)
 
 
+def subdivided(edges: Array, step_s: float) -> Array:
+    """Times (n,) from the first of `edges` to the last, equally spaced between them by no more than a step."""
+    count = np.maximum(1, np.ceil(np.diff(edges) / step_s - 1e-6)).astype(int)
+    inner = [a + (b - a) * np.arange(n) / n for a, b, n in zip(edges[:-1], edges[1:], count, strict=True)]
+    return np.concatenate([*inner, edges[-1:]])
+
+
 def common_grid(problem: NavigationProblem) -> Array:
     """State times (K,): measurement epochs of every moving vehicle, merged, gaps filled to `max_state_interval_s`.
 
@@ -71,11 +78,10 @@ def common_grid(problem: NavigationProblem) -> Array:
     keep = np.concatenate([[True], np.diff(edges) > (MERGE_S if all(v.imu is not None for v in moving) else 1e-3)])
     edges = edges[keep]
     step = problem.settings.max_state_interval_s
-    count = np.maximum(1, np.ceil(np.diff(edges) / step - 1e-6)).astype(int)
-    if count.sum() > MAX_STATES:
+    if (last - first) / step + len(edges) > MAX_STATES:
+        states = (last - first) / step
         raise InputError(
-            f"the flight spans {last - first:.0f} s and would need {count.sum()} states; check for a wrong time stamp "
+            f"the flight spans {last - first:.0f} s and would need {states:.0f} states; check for a wrong time stamp "
             f"or raise settings.max_state_interval_s above {step} s"
         )
-    inner = [a + (b - a) * np.arange(n) / n for a, b, n in zip(edges[:-1], edges[1:], count, strict=True)]
-    return np.concatenate([*inner, edges[-1:]])
+    return subdivided(edges, step)

@@ -25,7 +25,12 @@ class Method(Protocol):
 
 
 METHODS = Names(
-    "method", "relnav.methods", (Named("graph", "factorgraph.graphs.batch:Batch", "GTSAM factor graph over the whole flight"),)
+    "method",
+    "relnav.methods",
+    (
+        Named("graph", "factorgraph.graphs.batch:Batch", "GTSAM factor graph over the whole flight"),
+        Named("least-squares", "factorgraph.least_squares.batch:Batch", "CasADi least squares over the whole flight"),
+    ),
 )
 
 

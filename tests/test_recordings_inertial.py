@@ -12,8 +12,8 @@ from factorgraph.attitude import matrix_from_quat
 from factorgraph.graphs.batch import Batch
 from factorgraph.measurements import PositionStream
 from factorgraph.problem import Constraints, NavigationProblem
+from factorgraph.sampling import interpolate
 from factorgraph.solution import Solution
-from factorgraph.start import interpolate
 from factorgraph.types import Array, BoolArray
 from scenarios.flights import load
 from tests.helpers import shared_data, wheel_file

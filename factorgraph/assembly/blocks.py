@@ -335,6 +335,14 @@ def share_states(a: Endpoint, b: Endpoint) -> None:
             end.query = end.vehicle.query(end.vehicle.t_s[q.k] + q.dt_s, q.lever_b, states)
 
 
+def interval_of(ends: Sequence[Endpoint]) -> IntArray:
+    """A number (m,) for the states that the measurements of some ends belong to."""
+    interval = np.zeros(len(ends[0].query.k), np.int64)
+    for end in ends:
+        interval = interval * len(end.vehicle.t_s) + end.query.k
+    return interval
+
+
 class Columns:
     """Columns of a block with several ends: those of one end after those of another, what they share only once."""
 
@@ -404,10 +412,7 @@ class EndsBlock(Block):
 
     def regroup(self) -> None:
         """Sort rows into factors again after their points moved to other states: the rows of one interval share a factor."""
-        interval = np.zeros(self.n, np.int64)
-        for end in self.ends():
-            interval = interval * len(end.vehicle.t_s) + end.query.k
-        self.rows.factor = CommonGroups.from_labels(interval)
+        self.rows.factor = CommonGroups.from_labels(interval_of(self.ends()))
 
     def refresh(self) -> None:
         if any([end.refresh() for end in self.ends()]):

@@ -29,6 +29,7 @@ from factorgraph.assembly.blocks import (
     PositionBlock,
     RangeBlock,
     Rows,
+    interval_of,
 )
 from factorgraph.assembly.constraints import constraint_blocks
 from factorgraph.assembly.engine import Engine
@@ -51,10 +52,10 @@ from factorgraph.models.gnss import (
     pair_rows,
     system_of,
 )
-from factorgraph.models.receivers import Receiver, corrected
+from factorgraph.models.receivers import Quantity, Receiver, corrected, difference_sigma
 from factorgraph.problem import Antenna, Link, NavigationProblem, RangeModel
+from factorgraph.sampling import interpolate
 from factorgraph.solution import ParameterEstimate
-from factorgraph.start import interpolate
 from factorgraph.types import Array, BoolArray, IntArray
 
 
@@ -223,19 +224,13 @@ def _differences(
 ) -> tuple[IntArray, IntArray, Array, Array]:
     """Paired row, kind, difference and standard deviation of every usable observation, kinds one after the other."""
     ra, rb = pairs.a, pairs.b
-    na, nb = ref.antenna.noise, rov.antenna.noise
-    scale_a = elevation_scale(ref.prepared.elevation_rad[ra], na.elevation)
-    scale_b = elevation_scale(rov.prepared.elevation_rad[rb], nb.elevation)
     moving = np.all(np.isfinite(rov.prepared.sat_vel_n[rb]), axis=1)
     parts = []
-    for kind, sigma_a, sigma_b in (
-        (CODE, na.code_m, nb.code_m),
-        (PHASE, na.phase_m, nb.phase_m),
-        (DOPPLER, na.doppler_mps, nb.doppler_mps),
-    ):
+    quantities: dict[int, Quantity] = {CODE: "code_m", PHASE: "phase_m", DOPPLER: "doppler_mps"}
+    for kind, quantity in quantities.items():
         z = _difference(ref, rov, kind, ra, rb)
         use = np.flatnonzero(arc >= 0 if kind == PHASE else inside & np.isfinite(z) & (moving | (kind == CODE)))
-        parts.append((use, np.full(len(use), kind), z[use], np.hypot(sigma_a * scale_a, sigma_b * scale_b)[use]))
+        parts.append((use, np.full(len(use), kind), z[use], difference_sigma(quantity, ref, rov, ra, rb)[use]))
     row, kinds, z, sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
     return row, kinds, z, sigma
 
@@ -428,7 +423,7 @@ def range_blocks(model: RangeModel, ends: dict[str, VehicleVariables], parameter
         offset = time_offset(parameters.scalar(f"{stream.name} time offset", "s", model.time_sigma_s))
         tag_end = _ranged(ends[va], t, lever[ta], tags[ta[0]], model, parameters, offset)
         other = _ranged(ends[vb], t, lever[tb], tags[tb[0]], model, parameters, offset) if vb else None
-        interval = tag_end.query.k if other is None else tag_end.query.k * len(grid) + other.query.k
+        interval = interval_of([tag_end] if other is None else [tag_end, other])
         source = f"{stream.name} {va}-{vb or 'anchors'}"
         what = f"{stream.name} {tags[ta[0]].name}-{tags[tb[0]].name}" if model.per_pair else stream.name
         blocks.append(

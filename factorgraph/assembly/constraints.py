@@ -24,6 +24,7 @@ from factorgraph.assembly.sensors import AXES_B, AXES_N, Measured, Model, Mounti
 from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.attitude import log_so3, right_jacobian_inverse
 from factorgraph.errors import InputError
+from factorgraph.grid import subdivided
 from factorgraph.problem import NavigationProblem, Vehicle
 from factorgraph.rest import inside, rest_spans, union, zero_spans
 from factorgraph.types import Array, BoolArray, IntArray
@@ -117,9 +118,7 @@ def _times(end: VehicleVariables) -> Array:
     t = end.t_s[_thinned(end.t_s, interval)]
     if end.mode != "imu":
         return t
-    count = np.maximum(1, np.ceil(np.diff(t) / interval - 1e-6)).astype(int)
-    inner = [a + (b - a) * np.arange(n) / n for a, b, n in zip(t[:-1], t[1:], count, strict=True)]
-    times = np.concatenate([*inner, t[-1:]])
+    times = subdivided(t, interval)
     return times[end.is_carried(times)]
 
 

@@ -59,3 +59,6 @@ class Engine(Protocol):
 
     def linearise(self, graph: Graph, joints: bool) -> Linear:
         """The problem at the current variables; with `joints`, what covariances of pairs need is kept together."""
+
+    def remarks(self, graph: Graph) -> list[str]:
+        """What the engine can say of an elimination that failed."""

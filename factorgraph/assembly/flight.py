@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorgraph import start
 from factorgraph.assembly import graduated, integers, noise, phases, wide_lanes
 from factorgraph.assembly.attitudes import start_attitudes
 from factorgraph.assembly.blocks import KINDS
@@ -27,6 +26,7 @@ from factorgraph.models.receivers import Receiver, receivers
 from factorgraph.motion_imu import with_attitudes
 from factorgraph.problem import MotionPrior, NavigationProblem, Robust, Settings
 from factorgraph.registry import Progress
+from factorgraph.sampling import interpolate
 from factorgraph.solution import Solution, Status
 from factorgraph.types import Array
 
@@ -119,14 +119,14 @@ class WholeFlight:
         if v.name in rx:
             point = rx[v.name].point
             t = rx[v.name].vehicle.gnss.stream.t_s  # type: ignore[union-attr]
-            v.r = start.interpolate(grid, t, problem.frame.from_ecef(point.r_ecef))
+            v.r = interpolate(grid, t, problem.frame.from_ecef(point.r_ecef))
             velocity = problem.frame.rotate_from_ecef(point.v_ecef)
             if np.any(np.all(np.isfinite(velocity), axis=1)):
-                v.v = start.interpolate(grid, t, velocity)
+                v.v = interpolate(grid, t, velocity)
             return True
         if v.vehicle.positions:
             p = v.vehicle.positions[0]
-            v.r = start.interpolate(grid, p.t_s, p.r_n)
+            v.r = interpolate(grid, p.t_s, p.r_n)
             if len(grid) > 1:
                 v.v = np.asarray(np.gradient(v.r, grid, axis=0))
             return True

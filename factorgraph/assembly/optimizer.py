@@ -117,6 +117,33 @@ class Graph:
     def cost(self, losses: Mapping[str, Loss]) -> float:
         return sum(b.cost(losses) for b in self.blocks)
 
+    def name_of(self, key: int) -> str:
+        """What a variable is, in words."""
+        for v in self.vehicles:
+            for k in range(len(v.t_s)):
+                if key in v.keys(k):
+                    words = ("attitude or position", "velocity", "IMU bias") if v.mode == "imu" else ("position", "velocity")
+                    return f"the {words[v.keys(k).index(key)]} of {v.name} at {v.t_s[k]:.2f} s"
+        for parameter in self.parameters:
+            if parameter.key == key:
+                return parameter.name
+        for gnss in self.gnss:
+            for arc in np.flatnonzero(gnss.amb_key == key):
+                row = int(np.flatnonzero(gnss.arc == arc)[0])
+                return f"the ambiguity of {gnss.rows.label[gnss.rows.label_index[row]]} in {gnss.rows.source}"
+        return "a delay that changes slowly"
+
+    def worst_row(self) -> str | None:
+        """The measurement that is furthest from the current variables, in words."""
+        worst: tuple[float, str] | None = None
+        for b in self.blocks:
+            t = np.where(b.active & (b.rows.kind >= 0), np.abs(b.normalised()), -1.0)
+            i = int(np.argmax(t)) if b.n else 0
+            if b.n and t[i] > (worst[0] if worst else 0.0):
+                kind, label = KINDS[b.rows.kind[i]], b.rows.label[b.rows.label_index[i]]
+                worst = float(t[i]), f"{kind} {label} of {b.rows.source} at {b.rows.t_s[i]:.2f} s is off by {t[i]:.3g} sigma"
+        return worst[1] if worst else None
+
     def reweight(self, robust: Mapping[str, Loss], afresh: bool = False) -> dict[str, Loss]:
         """Robust weights of all rows at the current residuals; returns the losses, those that tune themselves as tuned."""
         losses = {kind: self._tuned(kind, loss) for kind, loss in robust.items()}

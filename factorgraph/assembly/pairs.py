@@ -14,7 +14,7 @@ from factorgraph.assembly.engine import Covariances
 from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.attitude import matrix_from_quat, skew
 from factorgraph.problem import Link, NavigationProblem, Vehicle
-from factorgraph.start import interpolate
+from factorgraph.sampling import interpolate
 from factorgraph.types import Array
 
 

@@ -385,7 +385,9 @@ def _warnings(
 ) -> list[str]:
     out = []
     if status is not Status.CONVERGED:
-        out.append(f"the optimisation stopped early: {status.value}")
+        worst = built.graph.worst_row()
+        out.append(f"the optimisation stopped early: {status.value}{'' if worst is None else f'; {worst}'}")
+        out += built.graph.engine.remarks(built.graph)
     if singular:
         out.append("no covariance: the normal matrix is singular")
     for data in built.links:

@@ -16,12 +16,11 @@ Source: Groves (2013), ch. 6 and 16, for odometer, magnetometer and their errors
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from factorgraph.assembly.blocks import ATTITUDE, BEARING, MAGNETIC, VELOCITY, Block, Endpoint, EndsBlock, Rows
+from factorgraph.assembly.blocks import ATTITUDE, BEARING, MAGNETIC, VELOCITY, Block, Endpoint, EndsBlock, Rows, interval_of
 from factorgraph.assembly.parameters import Parameter, Parameters
 from factorgraph.assembly.rows import in_grid, plain_rows, sensor_end
 from factorgraph.assembly.variables import VehicleVariables
@@ -100,14 +99,6 @@ class VectorBlock(EndsBlock):
         y, by_end, by_parameter = self.model()
         self.y = y[at]
         self.J = self.columns_of.join([J[at] for J in by_end], [J[at] for J in by_parameter])
-
-
-def interval_of(ends: Sequence[Endpoint]) -> IntArray:
-    """A number (m,) for the states that the measurements of some ends belong to."""
-    interval = np.zeros(len(ends[0].query.k), np.int64)
-    for end in ends:
-        interval = interval * len(end.vehicle.t_s) + end.query.k
-    return interval
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from factorgraph.graphs.engine import GtsamEngine
 from factorgraph.grid import common_grid
 from factorgraph.models.receivers import receivers
 from factorgraph.problem import NavigationProblem
-from factorgraph.start import interpolate
+from factorgraph.sampling import interpolate
 from factorgraph.types import Array
 
 

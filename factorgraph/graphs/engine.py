@@ -88,6 +88,10 @@ class GtsamEngine:
             self._order = structure, ordering(graph, linear)
         return LinearGraph(linear, self._order[1])
 
+    def remarks(self, graph: Graph) -> list[str]:
+        """GTSAM names no variable."""
+        return []
+
     def _of(self, block: Block) -> gtsam.NonlinearFactorGraph:
         """The block's factors, made once as long as its structure stays."""
         known = self._factors.get(id(block))

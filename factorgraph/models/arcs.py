@@ -30,7 +30,6 @@ class Arcs:
 
     of_row: IntArray  # (n,)
     count: int
-    slips: dict[str, int]  # reason -> number
     cause: IntArray  # (n,) of a row that begins an arc after another: index into CAUSES; -1 elsewhere
     half: BoolArray  # (n,) flagged as ambiguous by half a cycle
 
@@ -74,7 +73,7 @@ def find_arcs(a: GnssStream, b: GnssStream, pairs: PairedRows, usable: BoolArray
     sat = b.sat[pairs.b]
     order = rows[np.lexsort((pairs.epoch[rows], pairs.group[rows], sat[rows]))]
     if not len(order):
-        return Arcs(of_row, 0, {}, cause, half_a | half_b)
+        return Arcs(of_row, 0, cause, half_a | half_b)
     series = sat[order] * len(pairs.group_names) + pairs.group[order]
     same = np.concatenate([[False], series[1:] == series[:-1]])
     here, before = order[1:], order[:-1]
@@ -94,16 +93,14 @@ def find_arcs(a: GnssStream, b: GnssStream, pairs: PairedRows, usable: BoolArray
     reasons["geometry-free"] = _geometry_free_slips(a, b, pairs, sat, order, same, settings.slip_geometry_free_m)
     reasons["half-cycle flag"] = (half_a[here] != half_a[before]) | (half_b[here] != half_b[before])
     cut = np.zeros(len(here), bool)
-    slips = {}
     for name, flags in reasons.items():
         new = flags & same[1:] & ~cut
-        slips[name] = int(new.sum())
         cause[here[new]] = CAUSES.index(name)
         cut |= flags
     starts = np.concatenate([[True], cut | ~same[1:]])
     arc = np.cumsum(starts) - 1
     of_row[order] = arc
-    return Arcs(of_row, int(arc[-1]) + 1, slips, cause, half_a | half_b)
+    return Arcs(of_row, int(arc[-1]) + 1, cause, half_a | half_b)
 
 
 def _geometry_free_slips(

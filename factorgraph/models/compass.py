@@ -17,9 +17,9 @@ import numpy as np
 from ambiguity.constrained import float_solution, length_constrained
 from factorgraph.alignment import Directions
 from factorgraph.geodesy import LocalFrame
-from factorgraph.models.gnss import elevation_scale, pair_rows
-from factorgraph.models.receivers import Receiver
-from factorgraph.start import interpolate
+from factorgraph.models.gnss import pair_rows
+from factorgraph.models.receivers import Receiver, difference_sigma
+from factorgraph.sampling import interpolate
 from factorgraph.types import Array, IntArray
 
 EPOCHS = 200  # at most, evenly over the flight
@@ -80,11 +80,8 @@ class _Line:
         self.code = pb.code_m[rb] - pa.code_m[ra] - geometry
         self.phase = pb.phase_m[rb] - pa.phase_m[ra] - geometry
         self.wavelength = rover.antenna.stream.wavelength_m[rb]
-        na, nb = reference.antenna.noise, rover.antenna.noise
-        scale_a = elevation_scale(pa.elevation_rad[ra], na.elevation)
-        scale_b = elevation_scale(self.elevation, nb.elevation)
-        self.sigma_code = np.hypot(na.code_m * scale_a, nb.code_m * scale_b)
-        self.sigma_phase = np.hypot(np.hypot(na.phase_m * scale_a, nb.phase_m * scale_b), PHASE_M)
+        self.sigma_code = difference_sigma("code_m", reference, rover, ra, rb)
+        self.sigma_phase = np.hypot(difference_sigma("phase_m", reference, rover, ra, rb), PHASE_M)
 
     def at(self, rows: IntArray, group: IntArray, length: float) -> tuple[Array, float] | None:
         """The line (3,) and its standard deviation per axis at an epoch; None where its integers are in doubt."""

@@ -256,6 +256,44 @@ def _times(A: Array, x: Array) -> Array:
     return np.asarray((A @ x[..., None])[..., 0])
 
 
+def _freely(R: Array, r_n: Array, v_n: Array, p: Array, v: Array, dt: Array, g: Array, W: Array) -> tuple[Array, Array]:
+    """Positions and velocities (n, 3) at the intervals' ends, in the axes at their starts; p, v: corrected increments."""
+    h = dt[:, None]
+    r_next = r_n + (v_n + r_n @ W.T) * h + _times(R, p)
+    r_next += h**2 * (g / 2 + h * (g @ W.T) / 6 + h**2 * (g @ W.T @ W.T) / 24)
+    v_next = v_n + r_n @ W.T + _times(R, v) - r_next @ W.T
+    v_next += h * (g + h * (g @ W.T) / 2 + h**2 * (g @ W.T @ W.T) / 6)
+    return r_next, v_next
+
+
+def _corrected(part: Intervals, bias: Array, at_bias: Array, scale: Array | None) -> Array:
+    """Increments (n, 9) at biases (n, 6; gyroscope first) and scale factors of the states."""
+    order = np.r_[3:6, 0:3]  # biases with the accelerometer first
+    zeta = part.zeta + _times(part.by_bias, (bias - at_bias)[:, order])
+    return zeta if scale is None else zeta + part.by_scale @ scale[order]
+
+
+def carry(
+    part: Intervals,
+    R: Array,
+    r_n: Array,
+    v_n: Array,
+    bias: Array,
+    at_bias: Array,
+    gravitation_n: Array,
+    w_ie_n: Array,
+    scale: Array | None = None,
+) -> tuple[Array, Array, Array]:
+    """Attitudes (n, 3, 3), positions and velocities (n, 3) at the ends of intervals from those at their starts.
+
+    bias (n, 6; gyroscope first) of the starts; everything else as in `evaluate`.
+    """
+    zeta = _corrected(part, bias, at_bias, scale)
+    r_next, v_next = _freely(R, r_n, v_n, zeta[:, 3:6], zeta[:, 6:], part.dt_s, gravitation_n, skew(w_ie_n))
+    turn = exp_so3(-w_ie_n * part.dt_s[:, None])
+    return turn @ R @ exp_so3(zeta[:, :3]), _times(turn, r_next), _times(turn, v_next)
+
+
 def _residuals(states: States, zeta: Array, dt: Array, g: Array, w_ie: Array) -> tuple[Array, Array, Array]:
     """First nine rows, not whitened: residuals (n, 9), Jacobians (n, 9, 30) without biases and (n, 9, 9) to zeta."""
     n = len(dt)
@@ -263,10 +301,7 @@ def _residuals(states: States, zeta: Array, dt: Array, g: Array, w_ie: Array) ->
     Ri, RjT = states.R[:-1], np.swapaxes(states.R[1:], 1, 2)
     theta, p, v = zeta[:, :3], zeta[:, 3:6], zeta[:, 6:]
     turn = exp_so3(-w_ie * h)
-    r_next = states.r_n[:-1] + (states.v_n[:-1] + states.r_n[:-1] @ W.T) * h + _times(Ri, p)
-    r_next += h**2 * (g / 2 + h * (g @ W.T) / 6 + h**2 * (g @ W.T @ W.T) / 24)
-    v_next = states.v_n[:-1] + states.r_n[:-1] @ W.T + _times(Ri, v) - r_next @ W.T
-    v_next += h * (g + h * (g @ W.T) / 2 + h**2 * (g @ W.T @ W.T) / 6)
+    r_next, v_next = _freely(Ri, states.r_n[:-1], states.v_n[:-1], p, v, dt, g, W)
     dp, dv = _times(RjT, _times(turn, r_next) - states.r_n[1:]), _times(RjT, _times(turn, v_next) - states.v_n[1:])
     B = RjT @ turn  # n -> body of j
     E = exp_so3(theta)
@@ -301,11 +336,8 @@ def _evaluate(
     part: Intervals, states: States, bias: Array, at_bias: Array, g: Array, w_ie: Array, scale: Array | None
 ) -> tuple[Array, Array]:
     n = len(part.dt_s)
-    order = np.r_[3:6, 0:3]  # biases with the accelerometer first
-    b = bias[:, order]
-    zeta = part.zeta + _times(part.by_bias, b[:-1] - at_bias[:, order])
-    if scale is not None:
-        zeta += part.by_scale @ scale[order]
+    b = bias[:, np.r_[3:6, 0:3]]
+    zeta = _corrected(part, bias[:-1], at_bias, scale)
     e9, J9, K = _residuals(states, zeta, part.dt_s, g, w_ie)
     J = np.zeros((n, 15, 2 * STATE + (6 if scale is not None else 0)))
     J[:, :9, : 2 * STATE] = J9

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from factorgraph.errors import InputError
 from factorgraph.models.clock_jumps import NO_JUMPS, ClockJumps, clock_jumps, with_phases_following
-from factorgraph.models.gnss import Prepared, SinglePoint, prepare, single_point, system_of, without_ionosphere
+from factorgraph.models.gnss import Prepared, SinglePoint, elevation_scale, prepare, single_point, system_of, without_ionosphere
 from factorgraph.problem import Antenna, NavigationProblem, Vec3, Vehicle
-from factorgraph.start import interpolate
-from factorgraph.types import Array, BoolArray
+from factorgraph.sampling import interpolate
+from factorgraph.types import Array, BoolArray, IntArray
+
+Quantity = Literal["code_m", "phase_m", "doppler_mps"]  # of GnssNoise
 
 
 @dataclass(slots=True)
@@ -88,3 +91,11 @@ def corrected(problem: NavigationProblem, vehicle: Vehicle, point: SinglePoint, 
     )
     differenced = prepared if settings.ionosphere_model == "broadcast" else without_ionosphere(prepared)
     return Receiver(vehicle, point, clock_s, prepared, differenced, usable)
+
+
+def difference_sigma(quantity: Quantity, ref: Receiver, rov: Receiver, ra: IntArray, rb: IntArray) -> Array:
+    """Standard deviation (n,) of rover minus reference, for rows of the two."""
+    a, b = ref.antenna.noise, rov.antenna.noise
+    scale_a = elevation_scale(ref.prepared.elevation_rad[ra], a.elevation)
+    scale_b = elevation_scale(rov.prepared.elevation_rad[rb], b.elevation)
+    return np.asarray(np.hypot(getattr(a, quantity) * scale_a, getattr(b, quantity) * scale_b))

@@ -26,7 +26,7 @@ from factorgraph.gpstime import GpsTime
 from factorgraph.measurements import GnssStream, ReadReport
 from factorgraph.models.atmosphere import troposphere_m
 from factorgraph.models.gnss import look_angles, turned_satellites
-from factorgraph.start import interpolate
+from factorgraph.sampling import interpolate
 from factorgraph.types import Array, BoolArray, IntArray
 from scenarios.flights.epochs import approximate_position, every, points
 from scenarios.flights.navigation import Navigation

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from factorgraph.measurements import GnssStream
-from factorgraph.models.arcs import Arcs, find_arcs, split_at_steps
+from factorgraph.models.arcs import CAUSES, Arcs, find_arcs, split_at_steps
 from factorgraph.models.gnss import PairedRows, pair_rows
 from factorgraph.problem import AmbiguitySettings
 from factorgraph.types import Array, IntArray
@@ -69,7 +70,7 @@ def cuts(b: GnssStream, arcs: Arcs, pairs: PairedRows) -> dict[tuple[str, str], 
 
 
 def found(arcs: Arcs) -> dict[str, int]:
-    return {reason: n for reason, n in arcs.slips.items() if n}
+    return dict(Counter(CAUSES[cause] for cause in arcs.cause.tolist() if cause >= 0))
 
 
 def test_clean_observations_are_one_arc_each() -> None:

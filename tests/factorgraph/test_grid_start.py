@@ -14,7 +14,7 @@ from factorgraph.grid import common_grid
 from factorgraph.measurements import HeightStream, ImuStream, PositionStream, RangeStream, Tag
 from factorgraph.problem import NavigationProblem, RangeModel, Settings, Vehicle
 from factorgraph.registry import create, methods
-from factorgraph.start import interpolate
+from factorgraph.sampling import interpolate
 
 FRAME = LocalFrame(np.deg2rad(50.0), np.deg2rad(8.0), 300.0)
 

@@ -20,8 +20,8 @@ from factorgraph.grid import common_grid
 from factorgraph.models.receivers import receivers
 from factorgraph.problem import Settings
 from factorgraph.registry import solve
+from factorgraph.sampling import interpolate
 from factorgraph.solution import Fix, Solution, Status
-from factorgraph.start import interpolate
 from factorgraph.types import Array
 from scenarios.simulate import SimulatedFlight, load_scenario, simulate
 from scenarios.studies import replace_duration

@@ -11,8 +11,8 @@ from scipy.stats import chi2
 from factorgraph.attitude import log_so3, matrix_from_quat
 from factorgraph.graphs.batch import Batch
 from factorgraph.problem import Constraints, NavigationProblem, Vehicle
+from factorgraph.sampling import interpolate
 from factorgraph.solution import Solution, VehicleSolution
-from factorgraph.start import interpolate
 from factorgraph.types import Array
 from scenarios.simulate import load_scenario, simulate
 from scenarios.simulate.flight import SimulatedFlight, exact

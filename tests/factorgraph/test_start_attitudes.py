@@ -16,8 +16,8 @@ from factorgraph.grid import common_grid
 from factorgraph.models.receivers import receivers
 from factorgraph.problem import NavigationProblem
 from factorgraph.registry import solve
+from factorgraph.sampling import interpolate
 from factorgraph.solution import Status
-from factorgraph.start import interpolate
 from factorgraph.types import Array
 from scenarios.simulate import simulate
 from scenarios.simulate.scenario import parse

@@ -1,4 +1,4 @@
-"""Start values of positions and velocities on a grid. Attitudes have their own module, alignment."""
+"""Tables at other times. Solutions with IMUs have their own way, interpolation."""
 
 from __future__ import annotations
 

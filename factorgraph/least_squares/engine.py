@@ -1,0 +1,159 @@
+"""CasADi's derivatives and fronts along time as the engine of assembled problems.
+
+Every block is evaluated by its symbolic model (`evaluate`), exact Jacobian included; the linear systems are factored along the
+stages of the grid (`fronts`). Nothing is shared with the GTSAM engine but the rows' meaning, so that each checks the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from factorgraph.assembly.blocks import Block
+from factorgraph.assembly.keys import dimension
+from factorgraph.assembly.optimizer import Graph
+from factorgraph.least_squares.evaluate import Evaluator, evaluator
+from factorgraph.least_squares.fronts import (
+    FactorBlock,
+    Factorised,
+    Layout,
+    Part,
+    Scalars,
+    SelectedCovariance,
+    Undetermined,
+    Variables,
+)
+from factorgraph.types import Array, BoolArray, IntArray
+
+
+@dataclass(slots=True)
+class Factored:
+    """A linear problem factored along time."""
+
+    factor: Factorised
+    solution: Array | None = None
+
+    def step(self, keys: Sequence[int]) -> Array:
+        """The minimiser's components (n, d)."""
+        if self.solution is None:
+            self.solution = self.factor.step()
+        layout = self.factor.layout
+        at = layout.index(keys)
+        d = int(layout.dim[at[0]]) if len(at) else 0
+        return np.asarray(self.solution[layout.offset[at][:, None] + np.arange(d)])
+
+    def covariance(self, keys: Sequence[int]) -> Array:
+        """Joint covariance (d, d) of a few variables."""
+        return self.factor.covariance(keys)
+
+    def covariances(self) -> SelectedCovariance:
+        """Those of all variables that share a front: all states of one time, and what lives then."""
+        return self.factor.selected()
+
+
+@dataclass(slots=True)
+class LinearRows:
+    """Whitened rows of a linearised problem with their layout."""
+
+    layout: Layout
+    parts: list[Part]
+    engine: StageEngine
+
+    def eliminate(self, lam: float) -> Factored | None:
+        """Eliminate all variables, damped by lam; None where the problem is singular."""
+        found = self.layout.factorise(self.parts, lam)
+        if isinstance(found, Undetermined):
+            self.engine.undetermined = found
+            return None
+        return Factored(found)
+
+
+@dataclass(slots=True)
+class StageEngine:
+    """Blocks evaluated by symbolic models, eliminated front by front."""
+
+    packages: tuple[str, ...] = ("casadi",)
+    codegen: bool | None = None  # compiled models; None: as the environment says
+    undetermined: Undetermined | None = None  # why the last elimination failed
+    _evaluators: dict[int, tuple[Block, Evaluator]] = field(default_factory=dict)
+    _structure: tuple[list[object], Structure] | None = None
+
+    def predict(self, block: Block) -> None:
+        """Set the block's y and J at the current variables."""
+        known = self._evaluators.get(id(block))
+        if known is None or known[0] is not block:
+            known = self._evaluators[id(block)] = block, evaluator(block, self.codegen)
+        known[1].evaluate()
+
+    def linearise(self, graph: Graph, joints: bool) -> LinearRows:
+        """The blocks' whitened rows. The states of one time always share a front, so `joints` asks for nothing more."""
+        version: list[object] = [(id(block), block.version) for block in graph.blocks]
+        if self._structure is None or self._structure[0] != version:
+            self._structure = version, Structure.of(graph)
+        structure = self._structure[1]
+        parts = [part_of(block, used) for block, used in zip(graph.blocks, structure.used, strict=True)]
+        return LinearRows(structure.layout, parts, self)
+
+    def remarks(self, graph: Graph) -> list[str]:
+        """What the last elimination that failed could not determine."""
+        if self.undetermined is None:
+            return []
+        return [f"nothing measured determines {graph.name_of(self.undetermined.key)}"]
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """Where the variables and rows of a graph go."""
+
+    layout: Layout
+    used: list[BoolArray | None]  # (factors, k) of each block: columns that are variables; None: all
+
+    @classmethod
+    def of(cls, graph: Graph) -> Structure:
+        """States at their times, ambiguities and nodes while they are seen, constants last."""
+        blocks, used = [], []
+        for block in graph.blocks:
+            table = key_table(block)
+            mask = None if np.all(table) else table != 0
+            blocks.append(factor_block(block, table, mask))
+            used.append(mask)
+        stage: dict[int, int] = {}
+        for v in graph.vehicles:
+            for k in range(len(v.t_s)):
+                stage |= dict.fromkeys(reversed(v.keys(k)), k)  # biases first: the next time sees least of them
+        end = max(stage.values(), default=0)
+        stage |= {parameter.key: end for parameter in graph.parameters}
+        seen = [b.keys.ravel() for b in blocks] + [b.scalars.keys for b in blocks if b.scalars is not None]
+        present = set(np.unique(np.concatenate([np.zeros(0, np.int64), *seen])).tolist())
+        keys = [*(key for key in stage if key in present), *sorted(present - stage.keys())]
+        dims = np.array([dimension(key) for key in keys], np.int64)
+        last = np.array([stage.get(key, -1) for key in keys], np.int64)
+        return cls(Layout(Variables(np.array(keys, np.int64), dims, last), blocks), used)
+
+
+def factor_block(block: Block, table: IntArray, used: BoolArray | None) -> FactorBlock:
+    """The structure of a block. Where constants stand in for variables, its columns become scalars that differ in number."""
+    start = np.append(block.rows.factor.start, block.n).astype(np.int64)
+    own = block.scalars()
+    if own is not None:
+        return FactorBlock(block.widths(), table, start, Scalars(own.keys, own.first_key, own.first))
+    if used is None:
+        return FactorBlock(block.widths(), table, start)
+    first = np.concatenate([[0], np.cumsum(used.sum(axis=1))]).astype(np.int64)  # of one row and width each
+    return FactorBlock((), np.zeros((len(table), 0), np.int64), start, Scalars(table[used], first, first))
+
+
+def part_of(block: Block, used: BoolArray | None) -> Part:
+    """The numbers of a block, whitened before."""
+    own = block.scalars()
+    if own is not None:
+        return Part(block.e, block.Jw, own.dense)
+    return Part(block.e, block.Jw) if used is None else Part(block.e, np.zeros((block.n, 0)), block.Jw[used])
+
+
+def key_table(block: Block) -> IntArray:
+    """Keys (factors, k) of a block's columns, 0 for constants."""
+    n = len(block.rows.factor.start)
+    return np.array([block.keys(f) for f in range(n)], np.int64).reshape(n, len(block.widths()))
