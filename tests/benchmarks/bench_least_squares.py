@@ -2,7 +2,8 @@
 
 Two vehicles of 15 states each per stage (1200 stages unless told otherwise), some 30 ambiguities alive, 30 rows and two interval
 factors of 15 rows per stage: Layout, factorisation, step and covariances, beside SuperLU on the same normal equations in its own
-and in our order, and GTSAM's elimination along time, all in the same run. Rows are given, whitened. Processor time, best of several runs, since others may use the machine.
+and in our order, and GTSAM's elimination along time, all in the same run. Rows are given, whitened.
+Processor time, best of several runs, since others may use the machine.
 """
 
 from __future__ import annotations

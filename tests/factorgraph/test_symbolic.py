@@ -40,7 +40,6 @@ from tests.factorgraph.synthetic import FRAME
 
 EXACT = 1e-6
 IMU_STEP = {"x": (1e-3, 1e-2), "v": (1e-2,), "b": (1e-3, 1e-4), "l": (1e-4,)}
-MODES = [("imu", "imu"), ("motion", "imu"), ("fixed", "imu"), ("imu", "motion"), ("fixed", "motion")]
 
 
 # -- differences of the symbolic residuals ----------------------------------------------------------
