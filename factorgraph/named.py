@@ -35,13 +35,17 @@ class Names:
             found.setdefault(entry.name, Named(entry.name, entry.value, f"from {entry.dist.name if entry.dist else '?'}"))
         return found
 
-    def create(self, name: str) -> Any:
-        """An instance by name. Raises InputError with the nearest name for an unknown one."""
+    def named(self, name: str) -> Named:
+        """A choice by name, not imported. Raises InputError with the nearest name for an unknown one."""
         known = self.all()
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
             hint = f"; did you mean {near[0]}?" if near else "."
             raise InputError(f"no {self.kind} named {name}{hint} There are: {', '.join(known)}")
-        module, _, attribute = known[name].path.partition(":")
+        return known[name]
+
+    def create(self, name: str) -> Any:
+        """An instance by name. Raises InputError as `named`."""
+        module, _, attribute = self.named(name).path.partition(":")
         found = getattr(import_module(module), attribute)
         return found() if isinstance(found, type) else found

@@ -23,6 +23,7 @@ from factorgraph.errors import InputError
 from scenarios import guard
 
 OUT_ROOT = Path("relnav-out")
+DEFAULT_OUT = {"smooth": "{}", "compare": "compare-{}"}  # of a flight's name
 
 EXAMPLES = """\
 Examples
@@ -31,6 +32,7 @@ Examples
   relnav smooth my-flight                   results and report in relnav-out/my-flight
   relnav smooth my-flight --set ambiguity.fix=false --out float-only
   relnav simulate two-uav sim --seed 7      a flight with known truth, then: relnav smooth sim
+  relnav compare sim --methods graph,eskf   methods side by side: accuracy, consistency, time, memory
   relnav study aar --quick                  estimators compared over several simulated flights
 """
 
@@ -55,6 +57,7 @@ class Command:
     path: str
     add_options: Callable[[argparse.ArgumentParser], None] | None = None
     guarded: bool = False  # runs in a watched child process
+    leader: str = ""  # "module:function" that starts the watched children itself, one for each part
     more_options: str = ""  # "module:function" that adds to the parser what the options read so far ask for
 
 
@@ -89,6 +92,17 @@ def _smooth_options(parser: argparse.ArgumentParser) -> None:
     )
     _data_option(parser)
     parser.add_argument("--out", metavar="DIR", type=Path, help=f"folder of the results ({OUT_ROOT}{os.sep}FLIGHT)")
+
+
+def _compare_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("flight", metavar="FLIGHT", help="a flight folder, its flight.toml, or the name of a catalogue flight")
+    parser.add_argument("--methods", metavar="A,B,…", default="", help="the estimators; `relnav methods` lists them")
+    parser.add_argument("--repeat", metavar="N", type=_whole(1), default=1, help="solve so often; times are medians (1)")
+    parser.add_argument("--warm", action="store_true", help="run every method once before, so that no compilation is measured")
+    parser.add_argument("--force", action="store_true", help="run the methods again that are finished in the folder")
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="change a setting, as often as needed")
+    _data_option(parser)
+    parser.add_argument("--out", metavar="DIR", type=Path, help=f"folder of the results ({OUT_ROOT / 'compare-FLIGHT'})")
 
 
 def _rate(text: str) -> float | str:
@@ -176,6 +190,16 @@ COMMANDS = {
             "simulate", "SCENARIO OUT", "write a flight with known truth", ESTIMATE, f"{DO}:simulate", _simulate_options, True
         ),
         Command(
+            "compare",
+            "FLIGHT",
+            "methods side by side on one flight",
+            ESTIMATE,
+            "scenarios.compare:run_part",
+            _compare_options,
+            True,
+            leader="scenarios.compare:compare",
+        ),
+        Command(
             "study",
             "[NAME [OPTIONS]]",
             "compare estimators over many trials",
@@ -260,15 +284,17 @@ def _run(argv: list[str]) -> int:
         raise InputError(f"no command {argv[0]}{nearest(argv[0], list(COMMANDS))}; see relnav --help")
     command = COMMANDS[argv[0]]
     args = _parse(command, argv[1:])
-    if command.name == "smooth" and args.out is None:
-        args.out = OUT_ROOT / flight_name(args.flight)
+    if command.name in DEFAULT_OUT and args.out is None:
+        args.out = OUT_ROOT / DEFAULT_OUT[command.name].format(flight_name(args.flight))
     if not command.guarded:
-        return _call(command, args)
+        return _call(command.path, args)
+    if args.run_trace is None and command.leader:
+        return _call(command.leader, args)
     if args.run_trace is None:
         check_writable(args.out)
         return guard.run([*argv, *(["--out", str(args.out)] if command.name == "smooth" else [])], args.out)
     args.trace = guard.Trace(args.run_trace)
-    return _call(command, args)
+    return _call(command.path, args)
 
 
 def _parse(command: Command, argv: list[str]) -> argparse.Namespace:
@@ -288,8 +314,8 @@ def _parse(command: Command, argv: list[str]) -> argparse.Namespace:
     return parser.parse(argv)
 
 
-def _call(command: Command, args: argparse.Namespace) -> int:
-    code: int = _function(command.path)(args)
+def _call(path: str, args: argparse.Namespace) -> int:
+    code: int = _function(path)(args)
     return code
 
 

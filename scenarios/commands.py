@@ -109,7 +109,7 @@ def early_end(outputs: Outputs) -> Iterator[None]:
 def smooth(args: argparse.Namespace) -> int:
     """Estimate a flight and write solution, trajectories, summary and report."""
     outputs = Outputs(args.out)
-    _check_replaceable(args.out / SOLUTION)
+    check_replaceable(args.out / SOLUTION)
     _check_figures(args)
     with early_end(outputs), Stages(args.trace) as stages:
         problem, solution = _estimate(args, stages)
@@ -118,7 +118,7 @@ def smooth(args: argparse.Namespace) -> int:
     return _outcome(solution, outputs, stages)
 
 
-def _check_replaceable(folder: Path) -> None:
+def check_replaceable(folder: Path) -> None:
     """Saving a solution replaces its folder: raises InputError where that holds something else."""
     from scenarios.solutions import TEXT
 
@@ -134,6 +134,13 @@ def _check_figures(args: argparse.Namespace) -> None:
 def _estimate(args: argparse.Namespace, stages: Stages) -> tuple[NavigationProblem, Solution]:
     stages("loading the engine")
     registry.create(args.method)  # what is wrong here is told before the files are read
+    problem, doubts = read_problem(args, stages)
+    stages("solving")
+    return problem, solve(problem, doubts, args.method, stages)
+
+
+def read_problem(args: argparse.Namespace, stages: Stages) -> tuple[NavigationProblem, tuple[str, ...]]:
+    """The flight with its settings changed as asked, and what is doubtful in it."""
     override(Settings(), args.set)
     stages("reading the flight")
     from scenarios.flights import load
@@ -142,13 +149,16 @@ def _estimate(args: argparse.Namespace, stages: Stages) -> tuple[NavigationProbl
     for report in flight.reports:
         _tell_dropped(report, stages)
     problem = dataclasses.replace(flight.problem, settings=override(flight.problem.settings, args.set))
-    stages("solving")
-    doubts = tuple(str(finding) for finding in flight.examined.findings)
+    return problem, tuple(str(finding) for finding in flight.examined.findings)
+
+
+def solve(problem: NavigationProblem, doubts: tuple[str, ...], method: str, stages: Stages) -> Solution:
+    """The solution of a method, with what is doubtful in its input among the warnings."""
     try:
-        solution = registry.solve(problem, args.method, stages)
+        solution = registry.solve(problem, method, stages)
     except InputError as error:
         raise InputError(f"{error}; doubtful in the flight: {doubts[0]}" if doubts else str(error)) from error
-    return problem, _with_doubts(solution, doubts)
+    return _with_doubts(solution, doubts)
 
 
 def _with_doubts(solution: Solution, doubts: tuple[str, ...]) -> Solution:

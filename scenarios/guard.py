@@ -16,15 +16,16 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn
+from typing import IO, NoReturn
 
 DONE, DEGRADED, FAILED, BUG, INTERRUPTED = 0, 1, 2, 3, 130
 TRACE_OPTION = "--run-trace"
 CRASH_FILE = "crash.txt"
+POLL_S = 0.2
 RESEND_S = 0.5  # the child may not have installed its handler yet; it acts on the first signal only
 
 _ROOT = Path(__file__).resolve().parent.parent
@@ -98,20 +99,36 @@ def run(argv: Sequence[str], out: Path, quiet: bool = False) -> int:
 
     `out` is the folder of results: the trace of a crash is kept there. `quiet` drops what it prints on stdout.
     """
+    code, message = watch(argv, out, stdout=subprocess.DEVNULL if quiet else None)
+    if message:
+        print(f"relnav: {message}", file=sys.stderr)
+    return code
+
+
+def watch(
+    argv: Sequence[str],
+    out: Path,
+    on_stage: Callable[[str], None] | None = None,
+    stdout: int | None = None,
+    stderr: IO[bytes] | None = None,
+) -> tuple[int, str]:
+    """Run `relnav argv` in a child; its exit code, and the line that tells of a crash or a sudden end, else "".
+
+    `out` as in `run`. `on_stage` hears of each stage the child is in, about every POLL_S; `stdout` and `stderr` are where
+    the child prints.
+    """
     with tempfile.TemporaryDirectory(prefix="relnav-") as folder:
         trace = Path(folder) / "trace.txt"
-        child = _start([*argv, TRACE_OPTION, str(trace)], quiet)
-        code, was_killed = _wait(child)
+        child = _start([*argv, TRACE_OPTION, str(trace)], stdout, stderr)
+        code, was_killed = _wait(child, None if on_stage is None else lambda: on_stage(_stage(trace)))
         if was_killed or code == -signal.SIGINT:
-            print(f"relnav: stopped at once; what was finished is in {out}", file=sys.stderr)
-            return INTERRUPTED
+            return INTERRUPTED, f"stopped at once; what was finished is in {out}"
         if code not in (DONE, DEGRADED, FAILED, BUG, INTERRUPTED):
-            print(f"relnav: error: {_describe(code, trace)}{_keep(trace, out)}", file=sys.stderr)
-            return FAILED
-        return code
+            return FAILED, f"error: {_describe(code, trace)}{_keep(trace, out)}"
+        return code, ""
 
 
-def _start(argv: list[str], quiet: bool) -> subprocess.Popen[bytes]:
+def _start(argv: list[str], stdout: int | None, stderr: IO[bytes] | None) -> subprocess.Popen[bytes]:
     path = os.pathsep.join(p for p in (str(_ROOT), os.environ.get("PYTHONPATH", "")) if p)
     env = {**os.environ, "PYTHONPATH": path}
     # -P: a folder or file in the working directory must not hide a module
@@ -119,24 +136,27 @@ def _start(argv: list[str], quiet: bool) -> subprocess.Popen[bytes]:
     # an ignored signal stays ignored in the child until Trace takes it: no half-started interpreter is interrupted
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        return subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL if quiet else None)
+        return subprocess.Popen(command, env=env, stdout=stdout, stderr=stderr)
     finally:
         signal.signal(signal.SIGINT, before)
 
 
-def _wait(child: subprocess.Popen[bytes]) -> tuple[int, bool]:
-    """The child's exit code, and whether a second Ctrl-C killed it."""
+def _wait(child: subprocess.Popen[bytes], tick: Callable[[], None] | None) -> tuple[int, bool]:
+    """The child's exit code, and whether a second Ctrl-C killed it; `tick` is called while waiting."""
     restore = {number: signal.signal(number, signal.default_int_handler) for number in _requests_to_end()}
     interrupts = 0
     try:
         while True:
             try:
-                return child.wait(RESEND_S if interrupts else None), interrupts > 1
+                return child.wait(RESEND_S if interrupts else None if tick is None else POLL_S), interrupts > 1
             except KeyboardInterrupt:
                 interrupts += 1
                 _interrupt(child, interrupts > 1)
             except subprocess.TimeoutExpired:
-                _interrupt(child, False)
+                if interrupts:
+                    _interrupt(child, False)
+                elif tick is not None:
+                    tick()
     finally:
         for number, handler in restore.items():
             signal.signal(number, handler)
@@ -162,11 +182,20 @@ def _describe(code: int, trace: Path) -> str:
         what = f"the run was killed ({how}), often because memory ran out,"
     else:
         what = f"a native library crashed ({how})"
-    text = trace.read_text(encoding="utf-8", errors="replace") if trace.exists() else ""
-    stages = re.findall(r"^stage: (.*)$", text, re.MULTILINE)
+    text = _text(trace)
     files = ((Path(file), line) for file, line in re.findall(r'File "([^"]+)", line (\d+)', text))
     where = next((f" at {file.relative_to(_ROOT)}:{line}" for file, line in files if _is_ours(file)), "")
-    return f"{what} in the stage {stages[-1] if stages else 'start'!r}{where}"
+    return f"{what} in the stage {_stage(trace)!r}{where}"
+
+
+def _stage(trace: Path) -> str:
+    """What a child noted last."""
+    stages = re.findall(r"^stage: (.*)$", _text(trace), re.MULTILINE)
+    return stages[-1] if stages else "start"
+
+
+def _text(trace: Path) -> str:
+    return trace.read_text(encoding="utf-8", errors="replace") if trace.exists() else ""
 
 
 def _is_ours(file: Path) -> bool:

@@ -115,7 +115,7 @@ def vehicle_errors(vehicle: VehicleSolution) -> list[ErrorSeries]:
         return []
     if len(truth.t_s) > 2 and np.median(np.diff(truth.t_s)) < np.median(np.diff(vehicle.t_s)):
         truth = _thinned(truth, vehicle.t_s)
-    usable = _covered(vehicle.t_s, truth.t_s)
+    usable = covered(vehicle.t_s, truth.t_s)
     if not usable.any():
         return []
     t_s, enu = truth.t_s[usable], ("east", "north", "up")
@@ -260,14 +260,15 @@ def total_runtime_s(runtime_s: dict[str, float]) -> float:
     return runtime_s.get("total", sum(runtime_s.values()))
 
 
-def _covered(t_s: Array, at_s: Array) -> BoolArray:
+def covered(t_s: Array, at_s: Array) -> BoolArray:
+    """Which of the times at_s (m,) lie on epochs t_s (n,), n > 1, or between two of them that are not a gap apart."""
     step = np.diff(t_s)
     inside = (at_s >= t_s[0]) & (at_s <= t_s[-1])
     index, fraction = _bracket(t_s, at_s)
     on_epoch = (fraction <= 0) | (fraction >= 1)
     short = step[index] <= MAX_GAP_STEPS * float(np.median(step))
-    covered: BoolArray = inside & (on_epoch | short)
-    return covered
+    usable: BoolArray = inside & (on_epoch | short)
+    return usable
 
 
 def _bracket(t_s: Array, at_s: Array) -> tuple[IntArray, Array]:
@@ -298,7 +299,7 @@ def _slerp(q: Array, index: IntArray, fraction: Array) -> Array:
 
 def _thinned(truth: Truth, t_s: Array) -> Truth:
     """Truth at those of the times t_s that it covers."""
-    t = t_s[_covered(truth.t_s, t_s)]
+    t = t_s[covered(truth.t_s, t_s)]
     index, fraction = _bracket(truth.t_s, t)
     if truth.v_n is not None and np.isfinite(truth.v_n).all() and np.isfinite(truth.r_n).all():
         r_n = CubicHermiteSpline(truth.t_s, truth.r_n, truth.v_n)(t)
@@ -317,7 +318,7 @@ def _attitude_error(vehicle: VehicleSolution, truth: Truth, usable: BoolArray) -
     if known.sum() < 2:
         return phi
     t_known = vehicle.t_s[known]
-    rows = np.isfinite(q_true).all(axis=1) & _covered(t_known, t_s)
+    rows = np.isfinite(q_true).all(axis=1) & covered(t_known, t_s)
     if rows.any():
         C_est = matrix_from_quat(_slerp(vehicle.q_nb[known], *_bracket(t_known, t_s[rows])))
         phi[rows] = -log_so3(C_est @ np.swapaxes(matrix_from_quat(q_true[rows]), 1, 2))

@@ -63,6 +63,8 @@ class Page:
     lines: Sequence[str] = ()  # below the heading
     reasons: Sequence[str] = ()  # warnings
     maker: str = "relnav"  # in the footer
+    controls: str = ""  # HTML that stays in view with the navigation
+    script: str = ""  # a file beside this one that serves the controls
 
 
 def write_page(page: Page, path: Path) -> Path:
@@ -92,12 +94,13 @@ def render_page(page: Page) -> str:
             f"<title>{text(page.title)}</title>",
             f"<style>\n{_asset('page.css')}</style>\n</head>\n<body>",
             _headline(page),
-            f'<nav aria-label="Sections"><div>{links}</div></nav>',
+            f'<nav aria-label="Sections"><div>{links}</div>{page.controls}</nav>',
             f"<main>{''.join(body)}</main>",
             _footer(page.maker),
             '<noscript><p class="note">The plots of this page need JavaScript.</p></noscript>',
             f'<script type="text/plain" id="packed-plotly">{_packed_plotly()}</script>',
             f'<script type="text/plain" id="packed-charts">{_pack(payload)}</script>',
+            *([f"<script>\n{_asset(page.script)}</script>"] if page.script else []),
             f"<script>\n{_asset('page.js')}</script>\n</body>\n</html>\n",
         ]
     )

@@ -99,6 +99,7 @@
       div.on("plotly_relayout", (change) => follow(div, change));
       watchPlots.observe(div);
     }
+    document.dispatchEvent(new CustomEvent("drawn", { detail: div }));
   }
 
   async function drawAll(root) {

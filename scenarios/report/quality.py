@@ -165,7 +165,7 @@ def nis(diagnostics: Diagnostics, limit: int) -> Chart | None:
     note = f"{100 * test.share_inside:.1f} % of epochs lie inside the 95 % band. {thin_note(len(test.t_s), limit)}".strip()
     panel = Panel(
         "squared residuals",
-        _chi_square_traces(test.t_s, test.value, test.lower, test.upper, "NIS", limit),
+        chi_square_traces(test.t_s, test.value, test.lower, test.upper, "NIS", limit),
         _maybe_log(test.value),
     )
     return time_chart("Sum of squared normalised residuals per epoch", [panel], note)
@@ -220,7 +220,7 @@ def _sigma_levels(t_s: Array, outlier_sigma: float | None) -> list[Trace]:
     return [levels | {"x": seconds(x), "y": numbers(np.array([level, level, np.nan, -level, -level]))}]
 
 
-def _chi_square_traces(t_s: Array, value: Array, lower: Array, upper: Array, name: str, limit: int) -> list[Trace]:
+def chi_square_traces(t_s: Array, value: Array, lower: Array, upper: Array, name: str, limit: int) -> list[Trace]:
     rows, stretch = thin(limit, value), stretches(t_s)
     area = band(
         t_s[rows],
@@ -258,7 +258,7 @@ def errors(series: ErrorSeries, limit: int) -> Chart:
     if top is not None:
         notes.insert(0, "A few epochs lie far outside the vertical range; a double click shows them.")
     if np.isfinite(test.value).any():
-        traces = _chi_square_traces(t_s, test.value[known], test.lower[known], test.upper[known], "NEES", limit)
+        traces = chi_square_traces(t_s, test.value[known], test.lower[known], test.upper[known], "NEES", limit)
         panels.append(Panel("NEES", traces, log_axis(test.value)))
         notes.insert(0, f"NEES inside its 95 % band at {100 * test.share_inside:.1f} % of epochs.")
     return time_chart(f"{plot_text(series.subject)}: {series.quantity} error", panels, " ".join(filter(None, notes)))

@@ -47,12 +47,12 @@ def relative_track(pair: PairSolution, limit: int) -> list[Chart]:
     east, north, up = pair.baseline_enu.T
     distance, note = np.hypot(east, north), thin_note(len(pair.t_s), limit)
     truth = None if pair.truth_enu is None else pair.truth_enu.T
-    plan = _track(pair.t_s, east, north, limit) + _by_fix(pair, east, north, limit)
-    side = _track(pair.t_s, distance, up, limit) + _by_fix(pair, distance, up, limit)
+    plan = track(pair.t_s, east, north, limit) + _by_fix(pair, east, north, limit)
+    side = track(pair.t_s, distance, up, limit) + _by_fix(pair, distance, up, limit)
     if truth is not None:
-        plan.insert(1, _track(pair.t_s, truth[0], truth[1], limit, "truth", TRUTH_COLOUR, dash="dash")[0])
-        side.insert(1, _track(pair.t_s, np.hypot(truth[0], truth[1]), truth[2], limit, "truth", TRUTH_COLOUR, dash="dash")[0])
-    origin = _points("reference", np.zeros(1), np.zeros(1), {"color": ALERT_COLOUR, "size": 11, "symbol": "cross"})
+        plan.insert(1, track(pair.t_s, truth[0], truth[1], limit, "truth", TRUTH_COLOUR, dash="dash")[0])
+        side.insert(1, track(pair.t_s, np.hypot(truth[0], truth[1]), truth[2], limit, "truth", TRUTH_COLOUR, dash="dash")[0])
+    origin = points("reference", np.zeros(1), np.zeros(1), {"color": ALERT_COLOUR, "size": 11, "symbol": "cross"})
     charts = [
         plane_chart(f"{plot_text(pair_name(pair))}: plan", [*plan, origin], "east [m]", "north [m]", note),
         plane_chart(f"{plot_text(pair_name(pair))}: side", side, "horizontal distance [m]", "up [m]", note),
@@ -71,14 +71,14 @@ def vehicle_map(vehicles: Sequence[VehicleSolution], limit: int) -> list[Chart]:
         east, north, up = vehicle.r_n.T
         if vehicle.is_fixed:
             marker = {"color": colour, "size": 12, "symbol": "triangle-up"}
-            plan.append(_points(f"{name} (base)", east[:1], north[:1], marker))
+            plan.append(points(f"{name} (base)", east[:1], north[:1], marker))
             continue
-        plan += _track(vehicle.t_s, east, north, limit, name, colour)
-        plan.append(_points("start", east[:1], north[:1], {"color": colour, "size": 9, "symbol": "circle-open"}))
+        plan += track(vehicle.t_s, east, north, limit, name, colour)
+        plan.append(points("start", east[:1], north[:1], {"color": colour, "size": 9, "symbol": "circle-open"}))
         heights += with_band(name, "m", vehicle.t_s, up, standard_deviations(vehicle.P[:, POS, POS])[:, 2], colour, limit)
         if vehicle.truth is not None:
             r_true = vehicle.truth.r_n.T
-            plan += _track(vehicle.truth.t_s, r_true[0], r_true[1], limit, "truth", TRUTH_COLOUR, dash="dash")
+            plan += track(vehicle.truth.t_s, r_true[0], r_true[1], limit, "truth", TRUTH_COLOUR, dash="dash")
             heights.append(truth_line(vehicle.truth.t_s, r_true[2], "m", limit))
     note = thin_note(max((len(v.t_s) for v in vehicles), default=0), limit)
     charts = [plane_chart("All vehicles in the local frame", plan, "east [m]", "north [m]", note)]
@@ -88,9 +88,10 @@ def vehicle_map(vehicles: Sequence[VehicleSolution], limit: int) -> list[Chart]:
     return charts
 
 
-def _track(
+def track(
     t_s: Array, x: Array, y: Array, limit: int, name: str = "track", colour: str = TRUTH_COLOUR, dash: str = "solid"
 ) -> list[Trace]:
+    """A path in a plane (n,), broken at gaps in time; thinned."""
     rows = thin(limit, x, y)
     breaks = np.flatnonzero(np.diff(stretches(t_s)[rows])) + 1
     style = {"color": colour, "width": 1.4, "dash": dash}
@@ -100,7 +101,8 @@ def _track(
     return [{"type": "scatter", "mode": mode, "name": name, "x": xs, "y": ys, "line": style, "hovertemplate": hover}]
 
 
-def _points(name: str, x: Array, y: Array, marker: dict[str, Any]) -> Trace:
+def points(name: str, x: Array, y: Array, marker: dict[str, Any]) -> Trace:
+    """Single points in a plane."""
     hover = "%{x:.3f} m, %{y:.3f} m"
     return {"type": "scatter", "mode": "markers", "name": name, "x": numbers(x), "y": numbers(y), "marker": marker} | {
         "hovertemplate": hover + "<extra>%{fullData.name}</extra>"
@@ -113,7 +115,7 @@ def _by_fix(pair: PairSolution, x: Array, y: Array, limit: int) -> list[Trace]:
     for status in Fix:
         mine = rows[pair.fix[rows] == status.value]
         if len(mine):
-            trace = _points(FIX_NAMES[status], x[mine], y[mine], {"color": FIX_COLOURS[status], "size": 5})
+            trace = points(FIX_NAMES[status], x[mine], y[mine], {"color": FIX_COLOURS[status], "size": 5})
             trace["customdata"] = seconds(pair.t_s[mine])
             trace["hovertemplate"] = "%{x:.3f} m, %{y:.3f} m at %{customdata:.2f} s<extra>%{fullData.name}</extra>"
             found.append(trace)

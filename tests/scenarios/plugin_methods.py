@@ -7,6 +7,7 @@ import os
 import time
 from dataclasses import replace
 
+from factorgraph.errors import InputError
 from factorgraph.problem import NavigationProblem
 from factorgraph.registry import Progress
 from factorgraph.solution import Solution, Status
@@ -21,6 +22,36 @@ class Example:
     def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
         progress("making up", 0.5)
         return replace(example_solution(n=60), name=problem.name)
+
+
+class Worse(Example):
+    """The same covariances with five times the errors, at every second epoch."""
+
+    def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
+        return worse(super().solve(problem, progress))
+
+
+def worse(solution: Solution, factor: float = 5.0, every: int = 2) -> Solution:
+    """A solution with errors so many times as large, at every so manieth epoch."""
+    vehicles, pairs = [], []
+    for v in solution.vehicles:
+        assert v.truth is not None
+        r_n = v.truth.r_n + factor * (v.r_n - v.truth.r_n)
+        rows = {name: getattr(v, name)[::every] for name in ("t_s", "v_n", "q_nb", "bias_gyro", "bias_accel", "P")}
+        vehicles.append(replace(v, r_n=r_n[::every], **rows))
+    for p in solution.pairs:
+        assert p.truth_enu is not None
+        baseline = p.truth_enu + factor * (p.baseline_enu - p.truth_enu)
+        names = ("t_s", "velocity_enu", "P", "fix", "ratio", "n_sat", "truth_enu", "truth_velocity_enu")
+        pairs.append(replace(p, baseline_enu=baseline[::every], **{name: getattr(p, name)[::every] for name in names}))
+    return replace(solution, method="worse", vehicles=tuple(vehicles), pairs=tuple(pairs))
+
+
+class Refusing(Example):
+    """Cannot solve any flight."""
+
+    def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
+        raise InputError("no vehicle has an odometer; add one")
 
 
 class Degraded(Example):
