@@ -30,6 +30,7 @@ METHODS = Names(
     (
         Named("graph", "factorgraph.graphs.batch:Batch", "GTSAM factor graph over the whole flight"),
         Named("least-squares", "factorgraph.least_squares.batch:Batch", "CasADi least squares over the whole flight"),
+        Named("moving-horizon", "factorgraph.least_squares.horizon:Horizon", "least squares over a sliding window, epoch by epoch"),
     ),
 )
 

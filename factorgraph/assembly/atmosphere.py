@@ -40,9 +40,11 @@ class NodeBlock(Block):
     """Prior and process of a block's nodes: one row per node, against the node before it."""
 
     of: Nodes
-    decay: Array  # (n,) share of the node before that stays
+    decay: Array  # (k,) share of the node before that stays
+    only: IntArray | None = None  # (n,) nodes that have rows, of a piece; all without it
 
     def keys(self, f: int) -> list[int]:
+        f = f if self.only is None else int(self.only[f])
         before = self.of.previous[f]
         own = int(self.of.key[f])
         return [own, 0 if before < 0 else int(self.of.key[before])]
@@ -52,8 +54,9 @@ class NodeBlock(Block):
 
     def predict(self) -> None:
         x, before = self.of.value, self.of.previous
-        self.y = -np.where(before >= 0, x - self.decay * x[before], x)
-        self.J = np.column_stack([np.ones(self.n), -self.decay])
+        y = -np.where(before >= 0, x - self.decay * x[before], x)
+        mine = slice(None) if self.only is None else self.only
+        self.y, self.J = y[mine], np.column_stack([np.ones(len(x)), -self.decay])[mine]
 
 
 def node_block(nodes: Nodes, process: Process, source: str) -> NodeBlock:

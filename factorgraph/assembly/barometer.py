@@ -43,6 +43,10 @@ class BarometerBlock(EndsBlock):
         j = int(self.node[self.rows.factor.start[f]])
         return [*EndsBlock.keys(self, f), int(self.nodes[0].key[j]), int(self.nodes[0].key[j + 1])]
 
+    def key_table(self) -> IntArray:
+        j = self.node[self.rows.factor.start]
+        return np.column_stack([EndsBlock.key_table(self), self.nodes[0].key[j], self.nodes[0].key[j + 1]])
+
     def widths(self) -> tuple[int, ...]:
         return (*EndsBlock.widths(self), 1, 1)
 

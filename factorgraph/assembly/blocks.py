@@ -106,6 +106,11 @@ class Block(ABC):
     def keys(self, f: int) -> list[int]:
         """Keys of factor f, in the order of the columns; 0 where there is a constant in place of the variable."""
 
+    def key_table(self) -> IntArray:
+        """Those of all factors (factors, k)."""
+        n = len(self.rows.factor.start)
+        return np.array([self.keys(f) for f in range(n)], np.int64).reshape(n, len(self.widths()))
+
     @abstractmethod
     def widths(self) -> tuple[int, ...]:
         """Column counts of those keys."""
@@ -274,6 +279,12 @@ class Endpoint:
     def keys(self, row: int) -> tuple[int, ...]:
         return (*self.vehicle.keys(int(self.query.k[row]))[: len(self.state_dims)], *(p.key for p in self.parameters))
 
+    def key_table(self, entries: IntArray) -> IntArray:
+        """Keys (n, k) of query entries."""
+        states = self.vehicle.key_table[self.query.k[entries], : len(self.state_dims)]
+        parameters = np.array([p.key for p in self.parameters], np.int64)
+        return np.hstack([states, np.tile(parameters, (len(entries), 1))])
+
     def identities(self) -> list[tuple[str, int]]:
         """What tells the columns' variables of one row apart from those of another end."""
         states = [("state", 10 * self.vehicle.index + i) for i in range(len(self.state_dims))]
@@ -372,6 +383,12 @@ class Columns:
         of_end = [end.keys(row) for end in self.ends]
         return [*(of_end[e][i] for e, i in self._slots), *(p.key for p in self.more)]
 
+    def key_table(self, entries: IntArray) -> IntArray:
+        """Keys (n, k) of query entries."""
+        of_end = [end.key_table(entries) for end in self.ends]
+        own = [of_end[e][:, i] for e, i in self._slots] + [np.full(len(entries), p.key) for p in self.more]
+        return np.column_stack(own) if own else np.zeros((len(entries), 0), np.int64)
+
     def join(self, parts: Sequence[Array], more: Sequence[Array] = ()) -> Array:
         """Jacobian (n, w) from one part per end (n, w_e) and one per further parameter (n, d)."""
         if not self.shared:
@@ -401,11 +418,14 @@ class EndsBlock(Block):
         self.columns_of = Columns(self.ends(), self.parameters())
 
     def keys(self, f: int) -> list[int]:
-        return self.columns_of.keys(self._entry(f))
+        return self.columns_of.keys(int(self.entries()[f]))
 
-    def _entry(self, f: int) -> int:
-        """Query entry of factor f."""
-        return int(self.rows.factor.start[f])
+    def key_table(self) -> IntArray:
+        return self.columns_of.key_table(self.entries())
+
+    def entries(self) -> IntArray:
+        """Query entry (factors,) of every factor."""
+        return self.rows.factor.start
 
     def widths(self) -> tuple[int, ...]:
         return self.columns_of.dims
@@ -431,8 +451,8 @@ class PositionBlock(EndsBlock):
     def ends(self) -> list[Endpoint]:
         return [self.end]
 
-    def _entry(self, f: int) -> int:
-        return f
+    def entries(self) -> IntArray:
+        return np.arange(len(self.rows.factor.start))
 
     def regroup(self) -> None:
         """A factor per fix, whatever its state."""
@@ -643,8 +663,8 @@ class GnssBlock(EndsBlock):
     def parameters(self) -> list[Parameter]:
         return self.biases
 
-    def keys(self, f: int) -> list[int]:
-        return self.columns_of.keys(f)
+    def entries(self) -> IntArray:
+        return np.arange(len(self.rows.factor.start))
 
     def regroup(self) -> None:
         """A factor per epoch, whatever its states; two antennas of one vehicle are seen from the same state."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
-from factorgraph.types import Array
+from factorgraph.types import Array, IntArray
 
 if TYPE_CHECKING:
     from factorgraph.assembly.blocks import Block
@@ -32,7 +32,7 @@ class Covariances(Protocol):
 class Eliminated(Protocol):
     """A linear problem after elimination."""
 
-    def step(self, keys: Sequence[int]) -> Array:
+    def step(self, keys: Sequence[int] | IntArray) -> Array:
         """The minimiser's components (n, d) of variables of one dimension."""
 
     def covariance(self, keys: Sequence[int]) -> Array:

@@ -54,6 +54,21 @@ class WholeFlight:
     def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
         """Solve a problem. Raises InputError for what cannot be estimated; anything less is in the diagnostics."""
         clock = _Clock(progress)
+        built, notes = self._started(problem, clock)
+        result, ratio = self._optimise(problem, built, clock)
+        clock.stage("covariances", 0.9)
+        solution = make_solution(problem, self.method, built, result, ratio, clock.spent, notes)
+        clock.stage("done", 1.0)
+        return solution
+
+    def started(self, problem: NavigationProblem, progress: Progress) -> tuple[Built, list[str], dict[str, float]]:
+        """The problem assembled at its start values, with notes and the seconds that stages took."""
+        clock = _Clock(progress)
+        built, notes = self._started(problem, clock)
+        clock.stage("", 0.3)
+        return built, notes, clock.spent
+
+    def _started(self, problem: NavigationProblem, clock: _Clock) -> tuple[Built, list[str]]:
         problem = with_attitudes(problem)
         grid = common_grid(problem)
         rx = receivers(problem)
@@ -64,11 +79,7 @@ class WholeFlight:
         built = build(problem, vehicles, rx, use_phase=True, engine=self.engine())
         for data in built.links:
             phases.prepare(data, problem.settings.ambiguity)
-        result, ratio = self._optimise(problem, built, clock)
-        clock.stage("covariances", 0.9)
-        solution = make_solution(problem, self.method, built, result, ratio, clock.spent, notes)
-        clock.stage("done", 1.0)
-        return solution
+        return built, notes
 
     def _start(
         self, problem: NavigationProblem, vehicles: list[VehicleVariables], rx: dict[str, Receiver], grid: Array

@@ -36,14 +36,19 @@ class ImuBlock(Block):
     intervals: Intervals = field(init=False)
     at_bias: Array = field(init=False)  # (K - 1, 6)
     gravitation_n: Array = field(init=False)  # (K - 1, 3)
+    first: int = 0  # state at which the intervals begin, of a piece of the flight
 
     def __post_init__(self) -> None:
         Block.__post_init__(self)
         self.refresh()
 
     def keys(self, f: int) -> list[int]:
-        x, v, b = self.vehicle.keys(f)
-        return [x, v, b, *self.vehicle.keys(f + 1), *(p.key for p in self.scales)]
+        k = self.first + f
+        return [*self.vehicle.keys(k), *self.vehicle.keys(k + 1), *(p.key for p in self.scales)]
+
+    def key_table(self) -> IntArray:
+        n, table = len(self.at_bias), self.vehicle.key_table[self.first : self.first + len(self.at_bias) + 1]
+        return np.hstack([table[:-1], table[1:], np.tile(np.array([p.key for p in self.scales], np.int64), (n, 1))])
 
     def widths(self) -> tuple[int, ...]:
         return (6, 3, 6, 6, 3, 6, *(3 for _ in self.scales))
@@ -71,7 +76,9 @@ class ImuBlock(Block):
     def predict(self) -> None:
         v = self.vehicle
         change = v.imu_scale - v.applied_scale if self.scales else None
-        e, J = evaluate(self.intervals, States(v.R, v.r, v.v), v.bias, self.at_bias, self.gravitation_n, v.frame.w_ie_n, change)
+        k = slice(self.first, self.first + len(self.at_bias) + 1)
+        states = States(v.R[k], v.r[k], v.v[k])
+        e, J = evaluate(self.intervals, states, v.bias[k], self.at_bias, self.gravitation_n, v.frame.w_ie_n, change)
         self.y = -e.ravel()
         self.J = J.reshape(self.n, -1)[:, self.kept]
 

@@ -110,16 +110,19 @@ class MotionBlock(Block):
     vehicle: VehicleVariables
     L: Array  # (K - 1, 6, 6)
     J0: Array  # (K - 1, 6, 12)
+    first: int = 0  # state at which the intervals begin, of a piece of the flight
 
     def keys(self, f: int) -> list[int]:
-        return [key(letter, self.vehicle.index, k) for k in (f, f + 1) for letter in ("p", "v")]
+        return [key(letter, self.vehicle.index, k) for k in (self.first + f, self.first + f + 1) for letter in ("p", "v")]
 
     def widths(self) -> tuple[int, ...]:
         return (3, 3, 3, 3)
 
     def predict(self) -> None:
         v = self.vehicle
-        x = np.hstack([v.r[:-1], v.v[:-1], v.r[1:], v.v[1:]])
+        k = slice(self.first, self.first + len(self.L) + 1)
+        r, vel = v.r[k], v.v[k]
+        x = np.hstack([r[:-1], vel[:-1], r[1:], vel[1:]])
         self.y = -np.einsum("nij,njk,nk->ni", self.L, self.J0, x).ravel()
         self.J = (self.L @ self.J0).reshape(self.n, 12)
 

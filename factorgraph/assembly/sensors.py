@@ -84,8 +84,8 @@ class VectorBlock(EndsBlock):
     def parameters(self) -> list[Parameter]:
         return list(self.estimated)
 
-    def _entry(self, f: int) -> int:
-        return int(self.of_row[self.rows.factor.start[f]])
+    def entries(self) -> IntArray:
+        return self.of_row[self.rows.factor.start]
 
     def regroup(self) -> None:
         self.rows.factor = CommonGroups.from_labels(interval_of(self.measured.ends)[self.of_row])

@@ -14,7 +14,7 @@ Perturbation of a pose: R Exp(dtheta), r + R drho.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -94,6 +94,7 @@ class VehicleVariables:
         self.preintegrated_bias = np.zeros((K, 6))
         letters = {"imu": "xvb", "motion": "pv", "fixed": ""}[self.mode]
         self._keys = [tuple(key(letter, index, k) for letter in letters) for k in range(K)]
+        self.key_table = np.array(self._keys, np.int64).reshape(K, len(letters))
         self.imu_offset: Parameter | None = None  # of the IMU's time tags, where it is estimated
         self.imu_applied_s = 0.0  # what of it the stream in use is free of
         self.gyro_scale: Parameter | None = None  # of the IMU, each axis, where they are estimated
@@ -268,18 +269,20 @@ class VehicleVariables:
     def trajectory(self, values: Trajectory) -> None:
         self.r, self.v, self.R, self.bias = values.r, values.v, values.R, values.bias
 
-    def retract(self, step: Callable[[Sequence[int]], Array]) -> None:
-        """Move all states by a step, which gives the components (K, d) of variables by their keys."""
+    def retract(self, step: Callable[[IntArray], Array], states: slice = slice(None)) -> None:
+        """Move states by a step, which gives the components (n, d) of variables by their keys; arrays are replaced."""
         if self.mode == "fixed":
             return
-        pose, velocity, *bias = (step([keys[i] for keys in self._keys]) for i in range(len(self.dims)))
-        self.v = self.v + velocity
+        pose, velocity, *bias = (step(keys) for keys in self.key_table[states].T)
+        r, v, R, b = (x.copy() for x in (self.r, self.v, self.R, self.bias))
+        v[states] += velocity
         if self.mode == "motion":
-            self.r = self.r + pose
-            return
-        self.r = self.r + np.einsum("kij,kj->ki", self.R, pose[:, 3:])
-        self.R = self.R @ exp_so3(pose[:, :3])
-        self.bias = self.bias + np.hstack([bias[0][:, 3:], bias[0][:, :3]])
+            r[states] += pose
+        else:
+            r[states] += np.einsum("kij,kj->ki", R[states], pose[:, 3:])
+            R[states] = R[states] @ exp_so3(pose[:, :3])
+            b[states] += np.hstack([bias[0][:, 3:], bias[0][:, :3]])
+        self.r, self.v, self.R, self.bias = r, v, R, b
 
     def origin_centrifugal(self) -> Array:
         """Centrifugal acceleration at the frame's origin (3,), which the Earth rate leaves out."""

@@ -17,7 +17,7 @@ from factorgraph.assembly.keys import dimension
 from factorgraph.assembly.optimizer import Graph
 from factorgraph.graphs.covariance import JointCovariance, covariance_of
 from factorgraph.graphs.ordering import Lives, elimination_order
-from factorgraph.types import Array
+from factorgraph.types import Array, IntArray
 
 PIVOT_MIN = 1e-13  # relative to its row
 WIDE = 60  # columns of all states of one time, above which a minimum-degree ordering finds less fill than time does
@@ -31,11 +31,11 @@ class Net:
     net: gtsam.GaussianBayesNet
     solution: gtsam.VectorValues | None = None
 
-    def step(self, keys: Sequence[int]) -> Array:
+    def step(self, keys: Sequence[int] | IntArray) -> Array:
         """The minimiser's components (n, d)."""
         if self.solution is None:
             self.solution = self.net.optimize()
-        return np.array([self.solution.at(key) for key in keys])
+        return np.array([self.solution.at(int(key)) for key in keys])
 
     def covariance(self, keys: Sequence[int]) -> Array:
         """Joint covariance (d, d) of a few variables."""

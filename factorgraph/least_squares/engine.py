@@ -6,7 +6,7 @@ stages of the grid (`fronts`). Nothing is shared with the GTSAM engine but the r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -35,14 +35,19 @@ class Factored:
     factor: Factorised
     solution: Array | None = None
 
-    def step(self, keys: Sequence[int]) -> Array:
-        """The minimiser's components (n, d)."""
+    def all(self) -> Array:
+        """The whole minimiser (N,), by the layout's offsets."""
         if self.solution is None:
             self.solution = self.factor.step()
+        return self.solution
+
+    def step(self, keys: Sequence[int] | IntArray) -> Array:
+        """The minimiser's components (n, d)."""
+        solution = self.all()
         layout = self.factor.layout
         at = layout.index(keys)
         d = int(layout.dim[at[0]]) if len(at) else 0
-        return np.asarray(self.solution[layout.offset[at][:, None] + np.arange(d)])
+        return np.asarray(solution[layout.offset[at][:, None] + np.arange(d)])
 
     def covariance(self, keys: Sequence[int]) -> Array:
         """Joint covariance (d, d) of a few variables."""
@@ -112,19 +117,33 @@ class Structure:
 
     @classmethod
     def of(cls, graph: Graph) -> Structure:
-        """States at their times, ambiguities and nodes while they are seen, constants last."""
+        """The structure of a whole flight."""
+        states = [[v.keys(k) for v in graph.vehicles] for k in range(len(graph.vehicles[0].t_s))]
+        return cls.along(graph.blocks, states, [p.key for p in graph.parameters], {})
+
+    @classmethod
+    def along(
+        cls,
+        of_blocks: Sequence[Block],
+        states: Sequence[Sequence[tuple[int, ...]]],
+        constants: Sequence[int],
+        ends: Mapping[int, int],
+    ) -> Structure:
+        """States at their times, ambiguities and nodes while they are seen or until stage ends[key], constants last.
+
+        states: keys of each vehicle's states, stage by stage.
+        """
         blocks, used = [], []
-        for block in graph.blocks:
-            table = key_table(block)
+        for block in of_blocks:
+            table = block.key_table()
             mask = None if np.all(table) else table != 0
             blocks.append(factor_block(block, table, mask))
             used.append(mask)
         stage: dict[int, int] = {}
-        for v in graph.vehicles:
-            for k in range(len(v.t_s)):
-                stage |= dict.fromkeys(reversed(v.keys(k)), k)  # biases first: the next time sees least of them
-        end = max(stage.values(), default=0)
-        stage |= {parameter.key: end for parameter in graph.parameters}
+        for k, of_vehicles in enumerate(states):
+            for keys_of in of_vehicles:
+                stage |= dict.fromkeys(reversed(keys_of), k)  # biases first: the next time sees least of them
+        stage |= dict.fromkeys(constants, max(len(states) - 1, 0)) | dict(ends)
         seen = [b.keys.ravel() for b in blocks] + [b.scalars.keys for b in blocks if b.scalars is not None]
         present = set(np.unique(np.concatenate([np.zeros(0, np.int64), *seen])).tolist())
         keys = [*(key for key in stage if key in present), *sorted(present - stage.keys())]
@@ -151,9 +170,3 @@ def part_of(block: Block, used: BoolArray | None) -> Part:
     if own is not None:
         return Part(block.e, block.Jw, own.dense)
     return Part(block.e, block.Jw) if used is None else Part(block.e, np.zeros((block.n, 0)), block.Jw[used])
-
-
-def key_table(block: Block) -> IntArray:
-    """Keys (factors, k) of a block's columns, 0 for constants."""
-    n = len(block.rows.factor.start)
-    return np.array([block.keys(f) for f in range(n)], np.int64).reshape(n, len(block.widths()))
