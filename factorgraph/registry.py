@@ -24,15 +24,23 @@ class Method(Protocol):
     def solve(self, problem: NavigationProblem, progress: Progress) -> Solution: ...
 
 
-METHODS = Names(
-    "method",
-    "relnav.methods",
-    (
-        Named("graph", "factorgraph.graphs.batch:Batch", "GTSAM factor graph over the whole flight"),
-        Named("least-squares", "factorgraph.least_squares.batch:Batch", "CasADi least squares over the whole flight"),
-        Named("moving-horizon", "factorgraph.least_squares.horizon:Horizon", "least squares over a sliding window, epoch by epoch"),
-    ),
+GRAPHS, LEAST_SQUARES, FILTERS = "factorgraph.graphs.", "factorgraph.least_squares.", "factorgraph.filters.recursive:"
+OURS = (
+    ("graph", f"{GRAPHS}batch:Batch", "GTSAM factor graph over the whole flight"),
+    ("least-squares", f"{LEAST_SQUARES}batch:Batch", "CasADi least squares over the whole flight"),
+    ("moving-horizon", f"{LEAST_SQUARES}horizon:Horizon", "least squares over a sliding window, epoch by epoch"),
+    ("eskf", f"{FILTERS}Recursive", "error-state Kalman filter"),
+    ("eskf-rts", f"{FILTERS}Smoothed", "error-state Kalman filter, smoothed (Rauch-Tung-Striebel)"),
+    ("ieks", f"{FILTERS}IteratedSmoother", "iterated Kalman smoother: the optimum of the whole flight by filters"),
+    ("strong-tracking", f"{FILTERS}StrongTrackingFilter", "error-state filter with a fading factor"),
+    ("huber", f"{FILTERS}HuberFilter", "error-state filter with Huber regressions"),
+    ("rackf", f"{FILTERS}Rackf", "error-state filter with robust weights and adaptive prediction"),
+    ("sage-husa", f"{FILTERS}SageHusa", "error-state filter, noise levels by Sage and Husa"),
+    ("iae", f"{FILTERS}Iae", "error-state filter, noise levels by a window of innovations"),
+    ("rae", f"{FILTERS}Rae", "error-state filter, noise levels by a window of residuals"),
+    ("forgetting", f"{FILTERS}Forgetting", "error-state filter, noise levels by forgetting weights"),
 )
+METHODS = Names("method", "relnav.methods", tuple(Named(*each) for each in OURS))
 
 
 def methods() -> dict[str, Named]:

@@ -20,7 +20,6 @@ from factorgraph.assembly.priors import MotionBlock
 from factorgraph.assembly.sensors import Measured, VectorBlock
 from factorgraph.assembly.variables import Query
 from factorgraph.models.differencing import CommonGroups
-from factorgraph.models.imu_interval import Intervals
 from factorgraph.models.preintegration import Increments
 from factorgraph.types import IntArray
 
@@ -109,7 +108,7 @@ def intervals_of(block: Interval, a: int, b: int) -> Interval:
         part.L, part.J0 = part.L[a:b], part.J0[a:b]
     else:
         part.at_bias, part.gravitation_n = part.at_bias[a:b], part.gravitation_n[a:b]
-        part.intervals = Intervals(*(getattr(part.intervals, name)[a:b] for name in Intervals.__dataclass_fields__))
+        part.intervals = part.intervals.between(a, b)
     return part
 
 

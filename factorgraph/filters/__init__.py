@@ -1,1 +1,6 @@
-"""Recursive filters: building blocks (`kalman`, `discretise`, `inertial`, `adaptive`), float ambiguities, systems of them."""
+"""Recursive filters.
+
+Building blocks: `kalman`, `sigma_points`, `updates`, `adaptive`, `smoother`, `discretise`, `inertial`. Float ambiguities and
+published systems of filters: `float_ambiguity`, `two_stage`, `tightly_coupled`. Any assembled flight: `sequential` sees it stage
+by stage, `recursive` filters it, `course` smooths it.
+"""

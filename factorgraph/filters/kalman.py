@@ -191,29 +191,51 @@ def observed(H: Array) -> IntArray:
 
 
 @njit(cache=True, error_model="numpy")
+def _of_columns(H: Array, columns: IntArray) -> Array:
+    out = np.empty((len(H), len(columns)))
+    for i in range(len(H)):
+        for j in range(len(columns)):
+            out[i, j] = H[i, columns[j]]
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _compressed(P: Array, y: Array, W: Array, columns: IntArray) -> tuple[Array, float]:
+    """Process whitened rows W (m, c) of the states `columns`, m > c, by as many rows as states; P changes in place."""
+    rest, c = compress(y, W), len(columns)
+    full = np.zeros((c, len(P)))
+    for i in range(c):
+        for j in range(i, c):
+            full[i, columns[j]] = W[i, j]
+    dx, nis = scalar_updates(P, y[:c], full)
+    return dx, nis + rest
+
+
+@njit(cache=True, error_model="numpy")
 def update_sequential(P: Array, nu: Array, H: Array, R: Array) -> tuple[Array, Array, float]:
     """As `update`, one whitened row after the other; the prior is not changed.
 
     Many rows that see few states, such as code and phase a position, are first compressed to as many rows as states.
     """
     out, columns = P.copy(), observed(H)
-    m, c = len(nu), len(columns)
-    if m <= c:
+    if len(nu) <= len(columns):
         y, W = whiten(nu, H, R)
         dx, nis = scalar_updates(out, y, W)
-        return dx, out, nis
-    seen = np.empty((m, c))
-    for i in range(m):
-        for j in range(c):
-            seen[i, j] = H[i, columns[j]]
-    y, W = whiten(nu, seen, R)
-    rest = compress(y, W)
-    full = np.zeros((c, len(P)))
-    for i in range(c):
-        for j in range(i, c):
-            full[i, columns[j]] = W[i, j]
-    dx, nis = scalar_updates(out, y[:c], full)
-    return dx, out, nis + rest
+    else:
+        y, W = whiten(nu, _of_columns(H, columns), R)
+        dx, nis = _compressed(out, y, W, columns)
+    return dx, out, nis
+
+
+@njit(cache=True, error_model="numpy")
+def update_white(P: Array, e: Array, H: Array) -> tuple[Array, Array, float]:
+    """As `update_sequential` with rows that are whitened already; none of the arguments is changed."""
+    out, columns = P.copy(), observed(H)
+    if len(e) <= len(columns):
+        dx, nis = scalar_updates(out, e, H)
+    else:
+        dx, nis = _compressed(out, e.copy(), _of_columns(H, columns), columns)
+    return dx, out, nis
 
 
 @njit(cache=True, error_model="numpy")

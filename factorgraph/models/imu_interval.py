@@ -59,6 +59,10 @@ class Intervals:
     by_scale: Array  # (n, 9, 6)
     whitening: Array  # (n, 15, 15) lower triangular
 
+    def between(self, a: int, b: int) -> Intervals:
+        """Intervals a to b - 1."""
+        return Intervals(*(getattr(self, name)[a:b] for name in Intervals.__dataclass_fields__))
+
 
 @njit(cache=True)
 def _jr_coefficients(a2):  # type: ignore[no-untyped-def]
@@ -292,6 +296,59 @@ def carry(
     r_next, v_next = _freely(R, r_n, v_n, zeta[:, 3:6], zeta[:, 6:], part.dt_s, gravitation_n, skew(w_ie_n))
     turn = exp_so3(-w_ie_n * part.dt_s[:, None])
     return turn @ R @ exp_so3(zeta[:, :3]), _times(turn, r_next), _times(turn, v_next)
+
+
+@njit(cache=True)
+def _carry_along(dt, zeta, g, w, R, r, v):  # type: ignore[no-untyped-def]
+    """Fill states 1 to n of R (n + 1, 3, 3), r, v (n + 1, 3) from state 0, one interval after the other."""
+    E, T, A, W = np.empty((4, 3, 3))
+    _polynomial(w, 0.0, 1.0, 0.0, W)
+    turn, Wr, Wg, WWg, a, b = np.empty((6, 3))
+    for k in range(len(dt)):
+        h = dt[k]
+        theta = zeta[k, :3]
+        t2 = theta[0] ** 2 + theta[1] ** 2 + theta[2] ** 2
+        jb, jc, _, _ = _jr_coefficients(t2)
+        _polynomial(theta, 1.0, 1 - jc * t2, jb, E)
+        for i in range(3):
+            turn[i] = -h * w[i]
+        t2 = turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2
+        jb, jc, _, _ = _jr_coefficients(t2)
+        _polynomial(turn, 1.0, 1 - jc * t2, jb, T)
+        _apply(W, r[k], Wr)
+        _apply(W, g[k], Wg)
+        _apply(W, Wg, WWg)
+        for i in range(3):
+            p = q = 0.0
+            for j in range(3):
+                p += R[k, i, j] * zeta[k, 3 + j]
+                q += R[k, i, j] * zeta[k, 6 + j]
+            a[i] = r[k, i] + (v[k, i] + Wr[i]) * h + p + h * h * (g[k, i] / 2 + h * Wg[i] / 6 + h * h * WWg[i] / 24)
+            b[i] = v[k, i] + Wr[i] + q + h * (g[k, i] + h * Wg[i] / 2 + h * h * WWg[i] / 6)
+        _apply(W, a, Wr)
+        for i in range(3):
+            b[i] -= Wr[i]
+        _mul(R[k], E, A)
+        _mul(T, A, R[k + 1])
+        _apply(T, a, r[k + 1])
+        _apply(T, b, v[k + 1])
+
+
+def carry_along(
+    part: Intervals,
+    states: States,
+    bias: Array,
+    at_bias: Array,
+    gravitation_n: Array,
+    w_ie_n: Array,
+    scale: Array | None = None,
+) -> None:
+    """States 1 to n from state 0, in place, through n intervals one after the other; bias (6; gyroscope first) of all.
+
+    Everything else as in `evaluate`; each step is that of `carry`.
+    """
+    zeta = _corrected(part, np.broadcast_to(bias, at_bias.shape), at_bias, scale)
+    _carry_along(part.dt_s, zeta, gravitation_n, w_ie_n, states.R, states.r_n, states.v_n)
 
 
 def _residuals(states: States, zeta: Array, dt: Array, g: Array, w_ie: Array) -> tuple[Array, Array, Array]:
