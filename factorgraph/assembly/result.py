@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph.assembly.blocks import CODE, CONSTRAINT, KINDS, Block, GnssBlock
 from factorgraph.assembly.build import Built, GnssLink
+from factorgraph.assembly.conditioned import EpochIntegers
 from factorgraph.assembly.engine import Covariances
 from factorgraph.assembly.optimizer import Graph, Result
 from factorgraph.assembly.pairs import PairEnd, pair_covariance, pair_ends, pair_truth
@@ -44,15 +45,24 @@ BETWEEN_EPOCHS_S = 2.0  # a state between two epochs no further apart shares the
 
 
 def make_solution(
-    problem: NavigationProblem, method: str, built: Built, result: Result, ratio: float, spent: dict[str, float], notes: list[str]
+    problem: NavigationProblem,
+    method: str,
+    built: Built,
+    result: Result,
+    ratio: float,
+    spent: dict[str, float],
+    notes: list[str],
+    integers: EpochIntegers | None = None,
 ) -> Solution:
-    """Collect everything known after the optimisation."""
+    """Collect everything known after the optimisation; `integers`: as they were at each state time, not for the flight."""
     graph = built.graph
     eliminated = graph.eliminate(joints=True)
     cov = eliminated.covariances() if eliminated is not None else None
     vehicles = tuple(_vehicle(v, cov) for v in graph.vehicles)
     links = {(d.link.reference, d.link.rover): d for d in built.links}
     pairs = tuple(_pair(problem, p, built, cov, links, ratio) for p in problem.wanted_pairs)
+    if integers is not None:
+        pairs = tuple(integers.applied(p) for p in pairs)
     residuals = _residuals(graph, problem.settings.outlier_sigma)
     slips = slip_table(built.links)
     nis_t, nis, dof = _nis(graph, cov)

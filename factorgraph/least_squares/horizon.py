@@ -22,14 +22,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from ambiguity import partial
 from factorgraph.assembly.atmosphere import NodeBlock
 from factorgraph.assembly.blocks import Block, EndsBlock, GnssBlock
+from factorgraph.assembly.conditioned import Conditioned, EpochIntegers, condition
 from factorgraph.assembly.flight import WholeFlight
 from factorgraph.assembly.inertial_block import ImuBlock
 from factorgraph.assembly.keys import dimension
@@ -41,14 +41,14 @@ from factorgraph.assembly.priors import MotionBlock, ParameterPrior, StatePrior
 from factorgraph.assembly.result import make_solution
 from factorgraph.assembly.rows import plain_rows
 from factorgraph.assembly.variables import VehicleVariables
-from factorgraph.attitude import exp_so3, log_so3, right_jacobian
+from factorgraph.attitude import exp_so3, log_so3, right_jacobian, right_jacobian_inverse
 from factorgraph.errors import InputError, positive
 from factorgraph.least_squares.engine import Factored, StageEngine, Structure, part_of
 from factorgraph.least_squares.fronts import Part, Undetermined
 from factorgraph.models.imu_interval import carry
 from factorgraph.problem import AmbiguitySettings, NavigationProblem, Robust
 from factorgraph.registry import Progress
-from factorgraph.solution import Fix, PairSolution, Solution, Status
+from factorgraph.solution import Solution, Status
 from factorgraph.types import Array, IntArray
 
 TIGHT = 1e-4  # of a bound's unit: how far a bound that holds may be left
@@ -138,7 +138,11 @@ class ArrivalBlock(Block):
 
     def predict(self) -> None:
         d = np.concatenate([place.since(before) for place, before in zip(self.places, self.before, strict=True)])
-        self.y, self.J = -(self.e0 + self.J0 @ d), self.J0
+        self.y, self.J = -(self.e0 + self.J0 @ d), self.J0.copy()
+        for place, before, (a, b) in zip(self.places, self.before, self.edges(), strict=True):
+            if len(before) == 2:  # positions are along body axes, and these have turned since
+                self.J[:, a : a + 3] = self.J0[:, a : a + 3] @ right_jacobian_inverse(d[None, a : a + 3])[0]
+                self.J[:, a + 3 : b] = self.J0[:, a + 3 : b] @ before[0].T @ place.value()[0]
 
 
 @dataclass(slots=True)
@@ -184,11 +188,8 @@ class Newest:
 
     values: list[tuple[Array, Array, Array, Array]]  # r, v, R, bias of each
     keys: list[int]  # of their variables and the parameters
-    P: Array  # joint covariance
+    found: Conditioned  # joint covariance, and how the integers were fixed
     spent_s: float
-    fixed: int  # ambiguities that condition it
-    free: int  # of those in the window
-    ratio: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -423,25 +424,12 @@ class MovingHorizon:
         P[:n] = T @ P[:n]
         P[:, :n] = P[:, :n] @ T.T
         values = [(v.r[b].copy(), v.v[b].copy(), v.R[b].copy(), v.bias[b].copy()) for v in self.vehicles]
-        fixed, ratio = 0, np.nan
-        if whole and self.ambiguity.fix:
-            a = np.array([self.places[key].value()[0][0] for key in whole])
-            Q, of = 0.5 * (P[n:, n:] + P[n:, n:].T), self.ambiguity
-            got = partial.fix(a, Q, ratio_threshold=of.ratio_threshold, min_success_rate=of.min_success_rate)
-            fixed = int(got.fixed.sum())
-            if fixed:
-                own = n + np.flatnonzero(got.fixed)
-                G = np.linalg.solve(P[np.ix_(own, own)], P[own, :n]).T
-                d, at, ratio = G @ (got.integers - a)[got.fixed], 0, float(got.ratio)
-                P[:n, :n] -= G @ P[own, :n]
-                moved = []
-                for v, value in zip(self.vehicles, values, strict=True):
-                    size = sum(v.dims)
-                    moved.append(_moved(v, value, d[at : at + size]))
-                    at += size
-                values = [self._inside(value) for value in moved]
-        P = P[:n, :n]
-        return Newest(values, keys, 0.5 * (P + P.T), time.perf_counter() - began, fixed, len(whole), ratio)
+        found = condition(P, np.array([self.places[key].value()[0][0] for key in whole]), self.ambiguity)
+        at = 0
+        for i, v in enumerate(self.vehicles if found.fixed else []):
+            values[i] = self._inside(_moved(v, values[i], found.dx[at : at + sum(v.dims)]))
+            at += sum(v.dims)
+        return Newest(values, keys, found, time.perf_counter() - began)
 
 
 def _row_of(place: Place) -> int:
@@ -506,7 +494,7 @@ class Outputs:
             return np.full((d, d), np.nan)
         edges = np.cumsum([0, *(dimension(key) for key in own.keys)])
         columns = np.concatenate([np.arange(edges[i], edges[i + 1]) for i in (own.keys.index(key) for key in keys)])
-        return np.asarray(own.P[np.ix_(columns, columns)])
+        return np.asarray(own.found.P[np.ix_(columns, columns)])
 
 
 class Horizon:
@@ -541,17 +529,6 @@ class Horizon:
         notes.append(
             f"steps of the window: median {1e3 * np.median(steps):.1f} ms, 99 % within {1e3 * np.quantile(steps, 0.99):.1f} ms"
         )
-        solution = make_solution(problem, "moving-horizon", built, Result(Status.CONVERGED, [0.0]), np.nan, spent, notes)
-        return replace(solution, pairs=tuple(_with_fix(p, newest) for p in solution.pairs))
-
-
-def _with_fix(pair: PairSolution, newest: list[Newest]) -> PairSolution:
-    """Status of the integers as each state was put out."""
-    fix = np.array([_status(each).value for each in newest])
-    return replace(pair, fix=np.where(pair.fix == Fix.NONE.value, pair.fix, fix), ratio=np.array([each.ratio for each in newest]))
-
-
-def _status(newest: Newest) -> Fix:
-    if newest.free == 0:
-        return Fix.NONE
-    return Fix.FIXED if newest.fixed == newest.free else Fix.PARTIAL if newest.fixed else Fix.FLOAT
+        integers = EpochIntegers.of([each.found for each in newest])
+        result = Result(Status.CONVERGED, [0.0])
+        return make_solution(problem, "moving-horizon", built, result, np.nan, spent, notes, integers)

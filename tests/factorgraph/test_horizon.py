@@ -76,6 +76,16 @@ def test_a_flight_is_followed_to_the_centimetre() -> None:
     assert any("steps of the window" in note for note in windowed.diagnostics.notes)
 
 
+def test_short_windows_forget_nothing() -> None:
+    """The covariance of the absolute position, which body axes that turn would eat away, is that of a window over everything."""
+    flight, _ = pair_flight(1.0, 10)
+    short, long = run(flight.problem, HorizonSettings(6.0)), run(flight.problem, HorizonSettings(100.0))
+    sigma = [np.sqrt(np.diagonal(s.vehicle("a").P, axis1=1, axis2=2)[:, :9]) for s in (short, long)]
+    np.testing.assert_allclose(sigma[0][20:], sigma[1][20:], rtol=0.05)
+    off = (short.vehicle("a").r_n - long.vehicle("a").r_n)[20:]
+    assert np.sqrt(np.mean((off / sigma[1][20:, :3]) ** 2)) < 0.1
+
+
 def test_bounds_hold_and_let_go() -> None:
     """Accelerometer biases kept within less than they are; wide bounds change nothing."""
     flight, _ = pair_flight(1.0, 10)
