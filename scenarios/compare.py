@@ -423,17 +423,14 @@ def _measured(
 
 
 def _store_bound(problem: NavigationProblem, folder: Path) -> None:
-    from factorgraph.graphs.bound import posterior_bound  # brings in GTSAM, which a light import must not
+    from factorgraph.bound import posterior_bound  # brings in CasADi, which a light import must not
 
-    try:
-        t_s, pairs = posterior_bound(problem)
-    except ValueError as error:
-        raise InputError(str(error)) from error
-    arrays = {f"P{i}": pairs[(p.reference, p.rover)] for i, p in enumerate(problem.wanted_pairs)}
+    bound = posterior_bound(problem)
+    arrays = {f"P{i}": bound.pairs[(p.reference, p.rover)] for i, p in enumerate(problem.wanted_pairs)}
 
     def write(part: Path) -> None:
         with part.open("wb") as file:
-            np.savez(file, allow_pickle=False, t_s=t_s, **arrays)
+            np.savez(file, allow_pickle=False, t_s=bound.t_s, **arrays)
 
     solutions.replace_with(folder / "bound.npz", write)
 

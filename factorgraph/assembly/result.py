@@ -162,6 +162,15 @@ def _state_map(v: VehicleVariables, k: int) -> Array:
     return T
 
 
+def state_covariances(v: VehicleVariables, cov: Covariances) -> Array:
+    """Covariances (K, 15, 15) of a moving vehicle's states; NaN where not estimated."""
+    K, n = len(v.t_s), 15 if v.mode == "imu" else 6
+    P = np.full((K, 15, 15), np.nan)
+    T = np.array([_state_map(v, k)[:n] for k in range(K)])
+    P[:, :n, :n] = T @ cov.joints([v.keys(k) for k in range(K)]) @ np.swapaxes(T, 1, 2)
+    return P
+
+
 def _vehicle(v: VehicleVariables, cov: Covariances | None) -> VehicleSolution:
     K = len(v.t_s)
     P = np.full((K, 15, 15), np.nan)
@@ -170,9 +179,7 @@ def _vehicle(v: VehicleVariables, cov: Covariances | None) -> VehicleSolution:
         P[:, :6, :6] = 0.0
         return VehicleSolution(v.name, v.t_s, v.r, v.v, np.full((K, 4), np.nan), nan3, nan3, P, v.vehicle.truth, True)
     if cov is not None:
-        n = 15 if v.mode == "imu" else 6
-        T = np.array([_state_map(v, k)[:n] for k in range(K)])
-        P[:, :n, :n] = T @ cov.joints([v.keys(k) for k in range(K)]) @ np.swapaxes(T, 1, 2)
+        P = state_covariances(v, cov)
     if v.mode == "imu":
         return VehicleSolution(v.name, v.t_s, v.r, v.v, quat_from_matrix(v.R), v.bias[:, :3], v.bias[:, 3:], P, v.vehicle.truth)
     return VehicleSolution(v.name, v.t_s, v.r, v.v, np.full((K, 4), np.nan), nan3, nan3, P, v.vehicle.truth)
