@@ -6,7 +6,7 @@ stages of the grid (`fronts`). Nothing is shared with the GTSAM engine but the r
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,6 +26,9 @@ from factorgraph.least_squares.fronts import (
     Variables,
 )
 from factorgraph.types import Array, BoolArray, IntArray
+
+
+REMEMBERED = 64  # layouts of windows
 
 
 @dataclass(slots=True)
@@ -128,10 +131,11 @@ class Structure:
         states: Sequence[Sequence[tuple[int, ...]]],
         constants: Sequence[int],
         ends: Mapping[int, int],
+        known: dict[Hashable, Layout] | None = None,
     ) -> Structure:
         """States at their times, ambiguities and nodes while they are seen or until stage ends[key], constants last.
 
-        states: keys of each vehicle's states, stage by stage.
+        states: keys of each vehicle's states, stage by stage; known: layouts made before, of which one may do under other names.
         """
         blocks, used = [], []
         for block in of_blocks:
@@ -149,7 +153,24 @@ class Structure:
         keys = [*(key for key in stage if key in present), *sorted(present - stage.keys())]
         dims = np.array([dimension(key) for key in keys], np.int64)
         last = np.array([stage.get(key, -1) for key in keys], np.int64)
-        return cls(Layout(Variables(np.array(keys, np.int64), dims, last), blocks), used)
+        key = np.array(keys, np.int64)
+        if known is None:
+            return cls(Layout(Variables(key, dims, last), blocks), used)
+        shape = (dims.tobytes(), last.tobytes(), *(_shape(block, np.argsort(key), np.sort(key)) for block in blocks))
+        if shape not in known:
+            if len(known) >= REMEMBERED:
+                known.clear()
+            known[shape] = Layout(Variables(key, dims, last), blocks)
+        return cls(known[shape].renamed(key), used)
+
+
+def _shape(block: FactorBlock, place: IntArray, names: IntArray) -> Hashable:
+    """What tells a block from another up to the variables' names; place (v,) of the sorted names (v,)."""
+    own = (block.widths, place[np.searchsorted(names, block.keys)].tobytes(), block.start.tobytes())
+    if block.scalars is None:
+        return own
+    s = block.scalars
+    return (*own, place[np.searchsorted(names, s.keys)].tobytes(), s.first_key.tobytes(), s.first.tobytes())
 
 
 def factor_block(block: Block, table: IntArray, used: BoolArray | None) -> FactorBlock:

@@ -28,6 +28,7 @@ Takahashi et al. (1973) for the sweep backwards.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -511,11 +512,10 @@ class Layout:
     """
 
     def __init__(self, variables: Variables, blocks: Sequence[FactorBlock]) -> None:
-        self.key, self.dim = np.asarray(variables.key, np.int64), np.asarray(variables.dim, np.int64)
+        self.dim = np.asarray(variables.dim, np.int64)
         self.offset = _starts(self.dim)
         self.blocks = tuple(blocks)
-        self._by_key = np.argsort(self.key, kind="stable")
-        self._sorted = self.key[self._by_key]
+        self._name(np.asarray(variables.key, np.int64))
         if np.any(self._sorted[1:] == self._sorted[:-1]):
             raise InputError(f"variable {self._sorted[1:][self._sorted[1:] == self._sorted[:-1]][0]} is given twice")
         every = self._incidence()
@@ -533,6 +533,16 @@ class Layout:
         self._to_user = np.repeat(self.offset[:-1][self._order] - self._column[:-1], self.dim[self._order])
         self._to_user = self._to_user + np.arange(self._column[-1])
         self._arrange(every.take(np.argsort(front, kind="stable")), np.sort(front))
+
+    def _name(self, key: IntArray) -> None:
+        self.key, self._by_key = key, np.argsort(key, kind="stable")
+        self._sorted = key[self._by_key]
+
+    def renamed(self, key: IntArray) -> Layout:
+        """The same structure of other variables: key (v,) in the order in which they were given. `blocks` keep the old names."""
+        other = copy.copy(self)
+        other._name(key)
+        return other
 
     def _incidence(self) -> _Incidence:
         none = np.zeros(0, np.int64)

@@ -21,7 +21,7 @@ Sukhatme (2010), Sliding window filter, for the marginalisation.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -44,7 +44,7 @@ from factorgraph.assembly.variables import VehicleVariables
 from factorgraph.attitude import exp_so3, log_so3, right_jacobian, right_jacobian_inverse
 from factorgraph.errors import InputError, positive
 from factorgraph.least_squares.engine import Factored, StageEngine, Structure, part_of
-from factorgraph.least_squares.fronts import Part, Undetermined
+from factorgraph.least_squares.fronts import Layout, Part, Undetermined
 from factorgraph.models.imu_interval import carry
 from factorgraph.problem import AmbiguitySettings, NavigationProblem, Robust
 from factorgraph.registry import Progress
@@ -238,6 +238,7 @@ class MovingHorizon:
         self.first, self.last = 0, -1
         self.lives = Lives.of(self.staged, self.processes)
         self.places = self._places()
+        self.layouts: dict[Hashable, Layout] = {}
         self.start: dict[int, float] = {}  # scalars in the window: where they began
         self.scales = [p for p in graph.parameters if p.name.endswith(" scale") and len(p.value) == 1]  # of range sets
 
@@ -264,7 +265,7 @@ class MovingHorizon:
         states = [[v.keys(k) for v in self.vehicles] for k in range(a, b + 1)]
         constants = [p.key for p in self.graph.parameters]
         ends = {key: min(self.lives.last[key], b) - a for key in self.start}
-        structure = Structure.along(blocks, states, constants, ends)
+        structure = Structure.along(blocks, states, constants, ends, self.layouts)
         leaving = self._leaving()
         arrival: Block | None = None
         for iteration in range(self.settings.iterations):
