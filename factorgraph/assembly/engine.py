@@ -29,11 +29,15 @@ class Covariances(Protocol):
         """Joint covariance (d, d) of several keys."""
 
 
-class Eliminated(Protocol):
-    """A linear problem after elimination."""
+class Step(Protocol):
+    """A move of all variables."""
 
     def step(self, keys: Sequence[int] | IntArray) -> Array:
-        """The minimiser's components (n, d) of variables of one dimension."""
+        """Components (n, d) of variables of one dimension."""
+
+
+class Eliminated(Step, Protocol):
+    """A linear problem after elimination; its step leads to the minimum."""
 
     def covariance(self, keys: Sequence[int]) -> Array:
         """Joint covariance (d, d) of any few variables."""

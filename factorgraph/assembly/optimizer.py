@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from factorgraph.assembly.blocks import KINDS, Block, GnssBlock
-from factorgraph.assembly.engine import Eliminated, Engine
+from factorgraph.assembly.engine import Eliminated, Engine, Step
 from factorgraph.assembly.nodes import Nodes
 from factorgraph.assembly.parameters import Parameters
 from factorgraph.assembly.variables import Trajectory, VehicleVariables
@@ -99,8 +99,8 @@ class Graph:
             nodes.value = of_nodes
         self.predict()
 
-    def move(self, eliminated: Eliminated) -> None:
-        """Move all variables by the step of a linear solution and evaluate every block there."""
+    def move(self, eliminated: Step) -> None:
+        """Move all variables by a step, such as that of a linear solution, and evaluate every block there."""
         for v in self.vehicles:
             v.retract(eliminated.step)
         for gnss in self.gnss:

@@ -27,7 +27,6 @@ from factorgraph.least_squares.fronts import (
 )
 from factorgraph.types import Array, BoolArray, IntArray
 
-
 REMEMBERED = 64  # layouts of windows
 
 

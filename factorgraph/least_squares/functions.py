@@ -70,7 +70,7 @@ class Samples:
         self._names = [str(name) for name in function.name_in()]
         self._sizes = {name: int(function.numel_in(name)) for name in self._names}
         self._outputs = [(str(name), int(function.numel_out(name))) for name in function.name_out()]
-        self._held: dict[str, Array] = {}
+        self.inputs: dict[str, Array] = {}
         self._mapped = function.map(n)
         self._buffer, self._run = self._mapped.buffer()
 
@@ -82,12 +82,12 @@ class Samples:
             given, size = np.asarray(inputs[name], float), self._sizes[name]
             if given.size != self.n * size:
                 given = np.broadcast_to(given, (self.n, size))
-            self._held[name] = np.ascontiguousarray(given).reshape(self.n, size)
-            self._buffer.set_arg(self._names.index(name), self._held[name].data)  # type: ignore[call-arg]
+            self.inputs[name] = np.ascontiguousarray(given).reshape(self.n, size)
+            self._buffer.set_arg(self._names.index(name), self.inputs[name].data)  # type: ignore[call-arg]
 
     def run(self) -> dict[str, Array]:
         """Outputs (n, size). Raises KeyError where an input was never set."""
-        missing = [name for name in self._names if name not in self._held]
+        missing = [name for name in self._names if name not in self.inputs]
         if missing:
             raise KeyError(f"{self._mapped.name()} has no {', '.join(missing)}")
         results = {}

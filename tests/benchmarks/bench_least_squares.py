@@ -3,6 +3,7 @@
 Two vehicles of 15 states each per stage (1200 stages unless told otherwise), some 30 ambiguities alive, 30 rows and two interval
 factors of 15 rows per stage: Layout, factorisation, step and covariances, beside SuperLU on the same normal equations in its own
 and in our order, and GTSAM's elimination along time, all in the same run. Rows are given, whitened.
+Then integers of random problems by bonmin beside the search of `ambiguity`.
 Processor time, best of several runs, since others may use the machine.
 """
 
@@ -18,7 +19,9 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from ambiguity import integer_least_squares
 from factorgraph.least_squares.fronts import FactorBlock, Factorised, Layout, Part, Scalars, Variables
+from factorgraph.least_squares.integers import nearest_integers
 from factorgraph.types import Array
 
 T = TypeVar("T")
@@ -147,6 +150,27 @@ def main() -> None:
     solution = net.optimize()
     x = np.concatenate([np.asarray(solution.at(int(k))) for k in layout.key])
     print(f"{'':60s} largest difference {np.abs(x - step).max():.1e}")
+    integers()
+
+
+def integers(problems: int = 10) -> None:
+    """Median times of both ways to the nearest integers, and how often they agree."""
+    rng = np.random.default_rng(2)
+    for n in (2, 4, 6, 8, 10):
+        times, agree = np.zeros((2, problems)), 0
+        for k in range(problems):
+            axes = np.linalg.qr(rng.standard_normal((n, n)))[0]
+            Q = axes @ np.diag(10 ** rng.uniform(-2.5, 1.0, n)) @ axes.T
+            Q = (Q + Q.T) / 2
+            a = rng.multivariate_normal(np.zeros(n), Q)
+            start = time.process_time()
+            found = nearest_integers(a, Q)
+            middle = time.process_time()
+            expected = integer_least_squares(a, Q)
+            times[:, k] = middle - start, time.process_time() - middle
+            agree += np.array_equal(found.integers, expected.candidates[0])
+        bonmin, search = 1e3 * np.median(times, axis=1)
+        print(f"{n:2d} ambiguities: bonmin {bonmin:8.2f} ms, search {search:6.3f} ms, {agree} of {problems} agree", flush=True)
 
 
 if __name__ == "__main__":
