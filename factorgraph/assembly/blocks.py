@@ -216,6 +216,9 @@ class Block(ABC):
 
     def explained(self, cov: Covariances) -> Array:
         """diag(J P J^T) (n,) of the whitened rows: what of their variance the solution follows. Call `whiten` before."""
+        scalars, table = self.scalars(), self.key_table()
+        if table.size and np.all(table) and (scalars is None or not len(scalars.keys)):
+            return _quadratic(self.Jw, cov.joints(table.tolist()), self.rows.factor.of_row)  # type: ignore[no-any-return]
         used = [self.columns(f) for f in range(len(self.rows.factor.start))]
         alike = len({len(keys) for keys, _ in used}) == 1 and bool(used[0][0])
         P = (
@@ -575,6 +578,19 @@ class ScalarColumns:
         """View (rows, width) of factor f's columns."""
         rows = int(self.start[f + 1] - self.start[f])
         return self.dense[self.first[f] : self.first[f + 1]].reshape(-1, rows).T
+
+
+@njit(cache=True)
+def _quadratic(J, P, at):  # type: ignore[no-untyped-def]
+    """J_i P_at(i) J_i^T (n,) of rows J (n, w) and matrices P (m, w, w)."""
+    out = np.zeros(len(J))
+    for i in range(len(J)):
+        for a in range(J.shape[1]):
+            part = 0.0
+            for b in range(J.shape[1]):
+                part += P[at[i], a, b] * J[i, b]
+            out[i] += J[i, a] * part
+    return out
 
 
 @njit(cache=True)

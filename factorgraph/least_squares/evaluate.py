@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numba import njit
 
 from factorgraph.assembly.atmosphere import NodeBlock
 from factorgraph.assembly.barometer import BarometerBlock
@@ -380,20 +381,25 @@ class _Gnss(Evaluator):
             out = part.predict(points)
             h[part.rows], by_rover[part.rows] = out["h"][:, 0], out["h_rover"][:, :3]
             for columns, (name, p) in zip(J, points.items(), strict=True):
-                columns[part.rows] = _chained(out[f"h_{name}"], p, part.at, columns.shape[1])
+                if columns.shape[1]:
+                    _chain(out[f"h_{name}"], part.at, p["r_a"], p["v_a"], part.rows, columns)
         block.by_rover = by_rover
         block.y = block.z - h - _linear_terms(block)
         block.J = block.columns_of.join(J, [(block.bias_of == i)[:, None].astype(float) for i in range(len(block.biases))])
 
 
-def _chained(by_point: Array, p: dict[str, Array], at: IntArray, width: int) -> Array:
-    """Jacobians (n, w) of rows from those to their points (n, 3 or 6) and the points' own."""
-    if not width:
-        return np.zeros((len(at), 0))
-    total = np.matmul(by_point[:, None, :3], p["r_a"].reshape(-1, 3, width)[at])[:, 0]
-    if by_point.shape[1] == 6:
-        total += np.matmul(by_point[:, None, 3:], p["v_a"].reshape(-1, 3, width)[at])[:, 0]
-    return np.asarray(total)
+@njit(cache=True)
+def _chain(by_point, at, of_r, of_v, rows, out):  # type: ignore[no-untyped-def]
+    """out[rows] = by_point (n, 3 or 6) times the Jacobians of points `at`, of_r and of_v (m, 3 w), w columns."""
+    w = out.shape[1]
+    for i in range(len(at)):
+        p, row = at[i], rows[i]
+        for k in range(3):
+            for c in range(w):
+                out[row, c] += by_point[i, k] * of_r[p, k * w + c]
+            if by_point.shape[1] == 6:
+                for c in range(w):
+                    out[row, c] += by_point[i, 3 + k] * of_v[p, k * w + c]
 
 
 def _linear_terms(block: GnssBlock) -> Array:
