@@ -24,21 +24,31 @@ class Method(Protocol):
     def solve(self, problem: NavigationProblem, progress: Progress) -> Solution: ...
 
 
-GRAPHS, LEAST_SQUARES, FILTERS = "factorgraph.graphs.", "factorgraph.least_squares.", "factorgraph.filters.recursive:"
+GRAPHS, LEAST_SQUARES, FILTERS = "factorgraph.graphs.", "factorgraph.least_squares.", "factorgraph.filters."
+RECURSIVE = {
+    "eskf": "error-state Kalman filter",
+    "ekf": "extended Kalman filter, total state with Euler angles",
+    "iekf": "error-state filter, updates iterated",
+    "inekf": "invariant extended Kalman filter",
+    "ukf": "unscented Kalman filter",
+    "ckf": "cubature Kalman filter",
+    "srukf": "square-root unscented Kalman filter",
+    "srckf": "square-root cubature Kalman filter",
+    "strong-tracking": "error-state filter with a fading factor",
+    "huber": "error-state filter with Huber regressions",
+    "rackf": "error-state filter with robust weights and adaptive prediction",
+    "sage-husa": "error-state filter, noise levels by Sage and Husa",
+    "iae": "error-state filter, noise levels by a window of innovations",
+    "rae": "error-state filter, noise levels by a window of residuals",
+    "forgetting": "error-state filter, noise levels by forgetting weights",
+}
 OURS = (
     ("graph", f"{GRAPHS}batch:Batch", "GTSAM factor graph over the whole flight"),
     ("least-squares", f"{LEAST_SQUARES}batch:Batch", "CasADi least squares over the whole flight"),
     ("moving-horizon", f"{LEAST_SQUARES}horizon:Horizon", "least squares over a sliding window, epoch by epoch"),
-    ("eskf", f"{FILTERS}Recursive", "error-state Kalman filter"),
-    ("eskf-rts", f"{FILTERS}Smoothed", "error-state Kalman filter, smoothed (Rauch-Tung-Striebel)"),
-    ("ieks", f"{FILTERS}IteratedSmoother", "iterated Kalman smoother: the optimum of the whole flight by filters"),
-    ("strong-tracking", f"{FILTERS}StrongTrackingFilter", "error-state filter with a fading factor"),
-    ("huber", f"{FILTERS}HuberFilter", "error-state filter with Huber regressions"),
-    ("rackf", f"{FILTERS}Rackf", "error-state filter with robust weights and adaptive prediction"),
-    ("sage-husa", f"{FILTERS}SageHusa", "error-state filter, noise levels by Sage and Husa"),
-    ("iae", f"{FILTERS}Iae", "error-state filter, noise levels by a window of innovations"),
-    ("rae", f"{FILTERS}Rae", "error-state filter, noise levels by a window of residuals"),
-    ("forgetting", f"{FILTERS}Forgetting", "error-state filter, noise levels by forgetting weights"),
+    ("ieks", f"{FILTERS}recursive:IteratedSmoother", "iterated Kalman smoother: the optimum of the whole flight by filters"),
+    *((name, f"{FILTERS}methods:{name}", summary) for name, summary in RECURSIVE.items()),
+    *((f"{name}-rts", f"{FILTERS}methods:{name}-rts", f"{summary}, smoothed") for name, summary in RECURSIVE.items()),
 )
 METHODS = Names("method", "relnav.methods", tuple(Named(*each) for each in OURS))
 

@@ -28,6 +28,7 @@ class Status(Enum):
     STALLED = "no step reduces the cost"
     SINGULAR = "normal matrix is singular"
     INTERRUPTED = "interrupted"
+    DIVERGED = "diverged"
 
 
 class Fix(Enum):

@@ -44,6 +44,7 @@ class Track:
     course: list[Stage] = field(default_factory=list)
     y: dict[int, Array] = field(default_factory=dict)  # block -> residuals (n,) that updates left
     w: dict[int, Array] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
 
 def joint(s: Stages, live: Sequence[int], k: int, F: Array | None, Q: Array | None) -> tuple[Array, Array]:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -31,7 +32,7 @@ from factorgraph.assembly.parameters import Parameter
 from factorgraph.assembly.pieces import sliced
 from factorgraph.assembly.priors import MotionBlock, ParameterPrior, StatePrior
 from factorgraph.assembly.variables import VehicleVariables
-from factorgraph.attitude import exp_so3, right_jacobian
+from factorgraph.filters.charts import BODY, Chart
 from factorgraph.models.imu_interval import States, carry_along, evaluate
 from factorgraph.types import Array, BoolArray, IntArray
 
@@ -83,21 +84,25 @@ class _Sorted:
     judged: BoolArray  # (n,) rows; undifferenced codes stand for errors that persist, constraints for nothing measured
 
 
-class _Part:
+class Part:
     """Factors f0 to f1 - 1 of a block, evaluated."""
 
     def __init__(self, of: _Sorted, f0: int, f1: int, part: EndsBlock) -> None:
         self.of, self.f0, self.f1, self.part = of, f0, f1, part
         self.row0 = of.block.slices(f0)[0]
-        clocks = part.rows.clocks
-        self.left = np.ones(part.n) if clocks is None else 1 - clocks.leverage(part.u)
+
+    @cached_property
+    def left(self) -> Array:
+        """Shares (n,) of the whitened rows that common clocks leave."""
+        clocks = self.part.rows.clocks
+        return np.ones(self.part.n) if clocks is None else 1 - clocks.leverage(self.part.u)
 
 
 class Stages:
     """Positions of all variables, lifetimes of scalars, rows and transitions of stages."""
 
-    def __init__(self, graph: Graph) -> None:
-        self.graph, self.vehicles = graph, [v for v in graph.vehicles if v.mode != "fixed"]
+    def __init__(self, graph: Graph, chart: Chart = BODY) -> None:
+        self.graph, self.vehicles, self.chart = graph, [v for v in graph.vehicles if v.mode != "fixed"], chart
         self.t_s = graph.vehicles[0].t_s
         self.K = len(self.t_s)
         self.offset: dict[int, int] = {}  # vehicle -> first column
@@ -272,24 +277,31 @@ class Stages:
 
     def rows(self, a: int, b: int) -> Iterator[StageRows]:
         """Rows of stages a to b - 1 at the current states."""
+        parts = self.parts(a, b)
+        for k in range(a, b):
+            yield self.stage_rows(k, parts)
+
+    def parts(self, a: int, b: int, evaluate: bool = True) -> list[Part]:
+        """What the blocks say of stages a to b - 1, evaluated at the current states or yet to be evaluated."""
         parts = []
         for s in self.sorted:
             f0, f1 = (int(x) for x in np.searchsorted(s.stage, [a, b]))
             if f1 > f0:
-                part = sliced(s.block, f0, f1)
-                part.predict()
-                part.whiten()
-                parts.append(_Part(s, f0, f1, part))
-        for k in range(a, b):
-            yield self._stage(k, parts)
+                part = Part(s, f0, f1, sliced(s.block, f0, f1))
+                if evaluate:
+                    part.part.predict()
+                    part.part.whiten()
+                parts.append(part)
+        return parts
 
     def rows_at_hand(self) -> Iterator[StageRows]:
         """Rows of all stages as the blocks hold them: evaluated and whitened by the caller."""
-        parts = [_Part(s, 0, len(s.stage), s.block) for s in self.sorted]
+        parts = [Part(s, 0, len(s.stage), s.block) for s in self.sorted]
         for k in range(self.K):
-            yield self._stage(k, parts)
+            yield self.stage_rows(k, parts)
 
-    def _stage(self, k: int, parts: Sequence[_Part]) -> StageRows:
+    def stage_rows(self, k: int, parts: Sequence[Part]) -> StageRows:
+        """Rows of stage k among those of parts."""
         place = {key: self.n_fixed + i for i, key in enumerate(self.live[k])}
         n = self.n_fixed + len(place)
         es, Hs, shares, kinds, judged, at = [], [], [], [], [], []
@@ -344,33 +356,25 @@ class Stages:
             y += decay * o.values[o.index]
         return np.array([y / sigma]), H
 
-    def move(self, a: int, D: Array) -> None:
-        """Move the states of stages a to a + m - 1 by D (m, states)."""
+    def move(self, a: int, D: Array) -> Array:
+        """Move the states of stages a to a + m - 1 by D (m, states).
+
+        Returns what takes errors about the states before to errors about those now (m, states, states).
+        """
         at = slice(a, a + len(D))
+        T = np.tile(np.eye(D.shape[1]), (len(D), 1, 1))
         for v in self.vehicles:
-            x = D[:, self.offset[v.index] :]
+            first = self.offset[v.index]
+            x = D[:, first : first + sum(v.dims)]
             if v.mode == "imu":
-                v.r[at] += np.einsum("kij,kj->ki", v.R[at], x[:, 3:6])
-                v.R[at] = v.R[at] @ exp_so3(x[:, :3])
-                v.v[at] += x[:, 6:9]
+                pose = slice(first, first + 9)
+                moved, T[:, pose, pose] = self.chart.move(States(v.R[at], v.r[at], v.v[at]), x[:, :9])
+                v.R[at], v.r[at], v.v[at] = moved.R, moved.r_n, moved.v_n
                 v.bias[at, 3:] += x[:, 9:12]
                 v.bias[at, :3] += x[:, 12:15]
             else:
                 v.r[at] += x[:, :3]
                 v.v[at] += x[:, 3:6]
-
-    def transport(self, D: Array) -> Array:
-        """Errors (m, states, states) about the states that `move` leads to by D (m, states), from errors about those before.
-
-        Exp(d + x) = Exp(d) Exp(Jr(d) x), and positions are along body axes, which turn: what is known of two vehicles'
-        difference would not survive with axes that do not.
-        """
-        T = np.tile(np.eye(D.shape[1]), (len(D), 1, 1))
-        for v in self.vehicles:
-            if v.mode == "imu":
-                at = self.offset[v.index]
-                turn, moved = slice(at, at + 3), slice(at + 3, at + 6)
-                T[:, turn, turn], T[:, moved, moved] = right_jacobian(D[:, turn]), exp_so3(-D[:, turn])
         return T
 
     def move_parameters(self, d: Array) -> None:

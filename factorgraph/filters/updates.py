@@ -143,10 +143,15 @@ def sigma_point(P: Array, residuals: Residuals, rule: Rule) -> Updated:
 def square_root(L: Array, residuals: Residuals, rule: Rule) -> Updated:
     """The same from and to a root of the covariance, P = L L' with L (n, n) lower triangular."""
     s = through(residuals, L, rule)
-    e, G, m = s.mean, -s.G, len(s.mean)
-    root_S = rooted([G, np.eye(m), s.E], s.sign)
+    return rooted_update(L, s.mean, -s.G, s.E, s.sign)
+
+
+def rooted_update(L: Array, e: Array, G: Array, E: Array, sign: float = 1.0) -> Updated:
+    """Update of a root L (n, n) by rows e (m,) with G = H L (m, n) and, besides their unit noise, E E' of E (m, any)."""
+    m = len(e)
+    root_S = rooted([G, np.eye(m), E], sign)
     K = np.linalg.solve(root_S.T, np.linalg.solve(root_S, G)).T
-    posterior = L @ rooted([np.eye(len(L)) - K @ G, K, K @ s.E], s.sign)
+    posterior = L @ rooted([np.eye(len(L)) - K @ G, K, K @ E], sign)
     t = np.linalg.solve(root_S, e)
     return Updated(L @ (K @ e), posterior @ posterior.T, float(t @ t), L=posterior)
 
