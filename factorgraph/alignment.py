@@ -32,7 +32,7 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from factorgraph.attitude import euler_from_matrix, exp_so3, log_so3, skew
+from factorgraph.attitude import euler_from_matrix, exp_so3, log_so3, skew, wrapped
 from factorgraph.errors import InputError
 from factorgraph.geodesy import LocalFrame
 from factorgraph.measurements import ImuStream
@@ -374,7 +374,7 @@ class _Linear:
         if prior.heading is not None:
             J = np.zeros((1, 12))
             J[0, PHI] = [0.0, 0.0, -1.0 / prior.heading[1]]  # heading counts clockwise
-            rows.append((np.array([_angle(_heading(R) - prior.heading[0]) / prior.heading[1]]), J))
+            rows.append((np.array([float(wrapped(_heading(R) - prior.heading[0])) / prior.heading[1]]), J))
         return rows
 
 
@@ -385,10 +385,6 @@ def _inverse_root(K: Array) -> Array:
 
 def _heading(R: Array) -> float:
     return float(euler_from_matrix(R)[2])
-
-
-def _angle(a: float) -> float:
-    return float(np.mod(a + np.pi, 2 * np.pi) - np.pi)
 
 
 def _levelled(linear: _Linear) -> Array:
@@ -539,7 +535,7 @@ def _stretch(known: _Known, rows: IntArray, heading: tuple[float, float] | None)
 
 def _declared(pieces: list[_Piece], heading: tuple[float, float]) -> list[_Piece]:
     """Windows whose heading nothing told, turned to the declared one."""
-    turn = exp_so3(np.array([0.0, 0.0, -_angle(heading[0] - _heading(pieces[0].fit.R))]))
+    turn = exp_so3(np.array([0.0, 0.0, -float(wrapped(heading[0] - _heading(pieces[0].fit.R)))]))
     for piece in pieces:
         piece.fit.R, piece.C_nb, piece.way = turn @ piece.fit.R, turn @ piece.C_nb, "declared"
     pieces[0].fit.P[PHI, PHI][2, 2] = heading[1] ** 2
@@ -629,6 +625,6 @@ def _joined(known: _Known, pieces: list[_Piece], heading: tuple[float, float] | 
     sigma = np.sqrt(np.diag(first.fit.P)[PHI])
     if first.way == "levelling":
         sigma = np.array([sigma[0], sigma[1], WIDEST_RAD[2]])
-    if heading is not None and abs(_angle(_heading(C_nb[0]) - heading[0])) > 4 * np.hypot(heading[1], sigma[2]):
+    if heading is not None and abs(float(wrapped(_heading(C_nb[0]) - heading[0]))) > 4 * np.hypot(heading[1], sigma[2]):
         heading = None
     return Alignment(C_nb, bias, first.way, sigma, heading)

@@ -23,42 +23,41 @@ def skew(v: Array) -> Array:
     return S
 
 
-def exp_so3(phi: Array) -> Array:
-    """Rotation matrix (..., 3, 3) of a rotation vector (..., 3)."""
+def _angles(phi: Array, series_below: float) -> tuple[Array, Array, Array, Array]:
+    """Of rotation vectors: angle squared, angle with 1 in place of small ones, which are small (..., 1, 1), [phi x]."""
     phi = np.asarray(phi, float)
     a2 = np.sum(phi * phi, axis=-1)[..., None, None]
     a = np.sqrt(a2)
-    small = a < 1e-4
-    a_safe = np.where(small, 1.0, a)
-    s = np.where(small, 1 - a2 / 6, np.sin(a_safe) / a_safe)
-    c = np.where(small, 0.5 - a2 / 24, (1 - np.cos(a_safe)) / a_safe**2)
-    S = skew(phi)
+    small = a < series_below
+    return a2, np.where(small, 1.0, a), small, skew(phi)
+
+
+def exp_so3(phi: Array) -> Array:
+    """Rotation matrix (..., 3, 3) of a rotation vector (..., 3)."""
+    a2, a, small, S = _angles(phi, 1e-4)
+    s = np.where(small, 1 - a2 / 6, np.sin(a) / a)
+    c = np.where(small, 0.5 - a2 / 24, (1 - np.cos(a)) / a**2)
     return np.asarray(np.eye(3) + s * S + c * (S @ S))
 
 
 def right_jacobian(phi: Array) -> Array:
     """Jr (..., 3, 3) of rotation vectors (..., 3): Exp(phi + d) = Exp(phi) Exp(Jr d) to first order."""
-    phi = np.asarray(phi, float)
-    a2 = np.sum(phi * phi, axis=-1)[..., None, None]
-    a = np.sqrt(a2)
-    small = a < 1e-4
-    a_safe = np.where(small, 1.0, a)
-    b = np.where(small, 0.5 - a2 / 24, (1 - np.cos(a_safe)) / a_safe**2)
-    c = np.where(small, 1 / 6 - a2 / 120, (a_safe - np.sin(a_safe)) / a_safe**3)
-    S = skew(phi)
+    a2, a, small, S = _angles(phi, 1e-4)
+    b = np.where(small, 0.5 - a2 / 24, (1 - np.cos(a)) / a**2)
+    c = np.where(small, 1 / 6 - a2 / 120, (a - np.sin(a)) / a**3)
     return np.asarray(np.eye(3) - b * S + c * (S @ S))
 
 
 def right_jacobian_inverse(phi: Array) -> Array:
     """Inverse of `right_jacobian` (..., 3, 3), for rotation vectors up to pi: Log(Exp(phi) Exp(d)) = phi + Jr^-1 d."""
-    phi = np.asarray(phi, float)
-    a2 = np.sum(phi * phi, axis=-1)[..., None, None]
-    a = np.sqrt(a2)
-    small = a < 1e-3
-    a_safe = np.where(small, 1.0, a)
-    c = np.where(small, 1 / 12 + a2 / 720, 1 / a_safe**2 - 0.5 / (a_safe * np.tan(a_safe / 2)))
-    S = skew(phi)
+    a2, a, small, S = _angles(phi, 1e-3)
+    c = np.where(small, 1 / 12 + a2 / 720, 1 / a**2 - 0.5 / (a * np.tan(a / 2)))
     return np.asarray(np.eye(3) + 0.5 * S + c * (S @ S))
+
+
+def wrapped(angle_rad: Array | float) -> Array:
+    """Angles in [-pi, pi)."""
+    return np.asarray((np.asarray(angle_rad) + np.pi) % (2 * np.pi) - np.pi)
 
 
 def log_so3(C: Array) -> Array:

@@ -24,7 +24,7 @@ from factorgraph.assembly.blocks import ATTITUDE, BEARING, MAGNETIC, VELOCITY, B
 from factorgraph.assembly.parameters import Parameter, Parameters
 from factorgraph.assembly.rows import in_grid, plain_rows, sensor_end
 from factorgraph.assembly.variables import VehicleVariables
-from factorgraph.attitude import exp_so3, log_so3, matrix_from_quat, right_jacobian, right_jacobian_inverse, skew
+from factorgraph.attitude import exp_so3, log_so3, matrix_from_quat, right_jacobian, right_jacobian_inverse, skew, wrapped
 from factorgraph.errors import InputError
 from factorgraph.measurements import (
     AttitudeStream,
@@ -290,11 +290,6 @@ def directions(d: Array) -> tuple[Array, Array]:
     J[:, 1, 2] = level / rho**2
     J[:, 2] = d / rho[:, None]
     return J, np.column_stack([np.arctan2(d[:, 0], d[:, 1]), np.arctan2(d[:, 2], level), rho])
-
-
-def wrapped(angle_rad: Array) -> Array:
-    """Angles in [-pi, pi)."""
-    return np.asarray((angle_rad + np.pi) % (2 * np.pi) - np.pi)
 
 
 # from streams to blocks
