@@ -285,6 +285,7 @@ def run(graph: Graph, method: Filter, losses: Mapping[str, Loss], progress: Call
         found.by_jacobians(progress)
     else:
         found.by_points(method.rule, progress)
+    found.watch.judge(float(found.s.t_s[-1]))
     return found
 
 

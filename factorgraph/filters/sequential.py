@@ -163,6 +163,8 @@ class Stages:
                 where = {int(key): (b, "amb_value", i) for i, key in enumerate(b.amb_key) if key}
             tables = {int(key): (nodes.value, i) for nodes in b.nodes for i, key in enumerate(nodes.key)}
             columns = b.scalars()
+            if columns is None and not tables:
+                continue
             for f, stage in enumerate(s.stage.tolist()):
                 keys = columns.of(f) if columns is not None else [key for key in b.keys(f) if key in tables]
                 for key in keys:

@@ -11,10 +11,12 @@ import pytest
 from factorgraph.assembly.blocks import EndsBlock
 from factorgraph.assembly.build import Built
 from factorgraph.assembly.flight import WholeFlight
+from factorgraph.assembly.pieces import sliced
 from factorgraph.attitude import log_so3, matrix_from_quat
-from factorgraph.filters import recursive
+from factorgraph.filters import methods
 from factorgraph.filters.course import ChainEngine
-from factorgraph.filters.sequential import Stages, sliced
+from factorgraph.filters.recursive import IteratedSmoother
+from factorgraph.filters.sequential import Stages
 from factorgraph.graphs.engine import GtsamEngine
 from factorgraph.models.imu_interval import Intervals, carry
 from factorgraph.problem import NavigationProblem
@@ -33,8 +35,7 @@ def floating(problem: NavigationProblem) -> NavigationProblem:
 
 @cache
 def solved(name: str) -> Solution:
-    method: type[recursive.Recursive] = getattr(recursive, name)
-    return method().solve(pair_flight(1.0, 3)[0].problem, quiet)
+    return methods.create(name, integers=False).solve(pair_flight(1.0, 3)[0].problem, quiet)
 
 
 def in_sigmas(solution: Solution) -> Array:
@@ -54,7 +55,7 @@ def in_sigmas(solution: Solution) -> Array:
     return np.array(found)
 
 
-@pytest.mark.parametrize("name", ["Recursive", "StrongTrackingFilter", "HuberFilter", "Rackf", "SageHusa", "Iae", "Forgetting"])
+@pytest.mark.parametrize("name", ["eskf", "iekf", "strong-tracking", "huber", "rackf", "sage-husa", "iae", "forgetting"])
 def test_filters_end_where_the_vehicles_are(name: str) -> None:
     solution = solved(name)
     assert solution.diagnostics.status is Status.CONVERGED
@@ -64,16 +65,16 @@ def test_filters_end_where_the_vehicles_are(name: str) -> None:
 
 
 def test_innovations_are_as_large_as_said() -> None:
-    found = solved("Recursive").diagnostics
+    found = solved("eskf").diagnostics
     assert 0.85 < found.nis[10:].sum() / found.nis_dof[10:].sum() < 1.2
-    assert set(np.unique(found.nis_t_s)) <= set(solved("Recursive").vehicle("a").t_s)
+    assert set(np.unique(found.nis_t_s)) <= set(solved("eskf").vehicle("a").t_s)
 
 
 def test_smoothed_filter_is_close_to_the_batch_solution() -> None:
     """One pass back is the batch solution but for what the first epochs' errors bend; the attitudes were degrees off."""
     flight, _ = pair_flight(1.0, 3)
     batch = WholeFlight("graph", GtsamEngine).solve(floating(flight.problem), quiet)
-    once = solved("Smoothed")
+    once = solved("eskf-rts")
     for name in "ab":
         x, y = once.vehicle(name), batch.vehicle(name)
         sigma = np.sqrt(np.einsum("kii->ki", y.P))
@@ -85,7 +86,7 @@ def test_smoothed_filter_is_close_to_the_batch_solution() -> None:
 def test_iterated_smoother_is_the_batch_solution() -> None:
     """With integers; Gauss-Newton forward and back along time, and in a graph."""
     flight, batch = pair_flight(1.0, 3)
-    found = recursive.IteratedSmoother().solve(flight.problem, quiet)
+    found = IteratedSmoother().solve(flight.problem, quiet)
     for name in "ab":
         x, y = found.vehicle(name), batch.vehicle(name)
         sigma = np.sqrt(np.einsum("kii->ki", y.P))
