@@ -5,33 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-
-@njit(cache=True)
-def _exp(phi, out):  # type: ignore[no-untyped-def]
-    """Rotation matrix of a rotation vector."""
-    x, y, z = phi[0], phi[1], phi[2]
-    a2 = x * x + y * y + z * z
-    if a2 < 1e-8:
-        s, c = 1 - a2 / 6, 0.5 - a2 / 24
-    else:
-        a = np.sqrt(a2)
-        s, c = np.sin(a) / a, (1 - np.cos(a)) / a2
-    out[0, 0], out[0, 1], out[0, 2] = 1 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y
-    out[1, 0], out[1, 1], out[1, 2] = c * x * y + s * z, 1 - c * (x * x + z * z), c * y * z - s * x
-    out[2, 0], out[2, 1], out[2, 2] = c * x * z - s * y, c * y * z + s * x, 1 - c * (x * x + y * y)
-
-
-@njit(cache=True)
-def _mul(A, B, out):  # type: ignore[no-untyped-def]
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
-
-
-@njit(cache=True)
-def _times(A, x, out):  # type: ignore[no-untyped-def]
-    for i in range(3):
-        out[i] = A[i, 0] * x[0] + A[i, 1] * x[1] + A[i, 2] * x[2]
+from factorgraph.models.small import apply, exp, mul
 
 
 @njit(cache=True)
@@ -63,16 +37,16 @@ def carried_points(k, dt_s, lever, R, r, v, g, rate, db, w_ie, dR, dv, dp, dR_g,
                 phi[i] += dR_g[n, i, j] * db[n, j]
                 p[i] += dp_g[n, i, j] * db[n, j] + dp_a[n, i, j] * db[n, 3 + j]
                 u[i] += dv_g[n, i, j] * db[n, j] + dv_a[n, i, j] * db[n, 3 + j]
-        _exp(phi, E)
-        _mul(dR[n], E, turned)
+        exp(phi, E)
+        mul(dR[n], E, turned)
         for i in range(3):
             x[i] = -w_ie[i] * ahead
-        _exp(x, E)
-        _mul(E, Rk, T)
-        _mul(T, turned, Rt)
+        exp(x, E)
+        mul(E, Rk, T)
+        mul(T, turned, Rt)
         R_out[n] = Rt
-        _times(turned, lb, at)  # lever arm, in the body frame of the state
-        _times(Rt, lb, x)
+        apply(turned, lb, at)  # lever arm, in the body frame of the state
+        apply(Rt, lb, x)
         for i in range(3):
             total = 0.0
             for j in range(3):
@@ -82,10 +56,10 @@ def carried_points(k, dt_s, lever, R, r, v, g, rate, db, w_ie, dR, dv, dp, dR_g,
             r_out[n, i] = r[k[n], i] + v[k[n], i] * dt + 0.5 * g[n, i] * ahead * ahead + total + x[i]
             J_r[n, i, 6 + i] = dt
         _minus_cross(Rk, phi, J_r[n, :, 0:3])
-        _mul(Rk, dp_a[n], J_r[n, :, 9:12])
+        mul(Rk, dp_a[n], J_r[n, :, 9:12])
         _minus_cross(Rt, lb, T)
-        _mul(T, dR_g[n], M)
-        _mul(Rk, dp_g[n], E)
+        mul(T, dR_g[n], M)
+        mul(Rk, dp_g[n], E)
         for i in range(3):
             for j in range(3):
                 J_r[n, i, 12 + j] = E[i, j] + M[i, j]
@@ -94,8 +68,8 @@ def carried_points(k, dt_s, lever, R, r, v, g, rate, db, w_ie, dR, dv, dp, dR_g,
         wl[0] = rate[n, 1] * lb[2] - rate[n, 2] * lb[1]
         wl[1] = rate[n, 2] * lb[0] - rate[n, 0] * lb[2]
         wl[2] = rate[n, 0] * lb[1] - rate[n, 1] * lb[0]
-        _times(turned, wl, at)
-        _times(Rt, wl, x)
+        apply(turned, wl, at)
+        apply(Rt, wl, x)
         for i in range(3):
             total = 0.0
             for j in range(3):
@@ -104,10 +78,10 @@ def carried_points(k, dt_s, lever, R, r, v, g, rate, db, w_ie, dR, dv, dp, dR_g,
             v_out[n, i] = v[k[n], i] + g[n, i] * ahead + total + x[i]
             J_v[n, i, 6 + i] = 1.0
         _minus_cross(Rk, phi, J_v[n, :, 0:3])
-        _mul(Rk, dv_a[n], J_v[n, :, 9:12])
-        _mul(Rk, dv_g[n], E)
+        mul(Rk, dv_a[n], J_v[n, :, 9:12])
+        mul(Rk, dv_g[n], E)
         _minus_cross(Rt, wl, M)
-        _mul(M, dR_g[n], turned)
+        mul(M, dR_g[n], turned)
         for i in range(3):
             for j in range(3):
                 J_v[n, i, 12 + j] = E[i, j] + turned[i, j] - T[i, j]

@@ -21,7 +21,8 @@ import numpy as np
 from numba import njit
 
 from factorgraph.filters.kalman import predict, scalar_updates
-from factorgraph.models.imu_interval import _apply, _carry_along, _inverse_coefficients, _jr_coefficients, _mul, _polynomial
+from factorgraph.models.imu_interval import carry_intervals
+from factorgraph.models.small import apply, inverse_coefficients, jr_coefficients, mul, polynomial
 from factorgraph.types import Array, BoolArray, IntArray
 
 LARGE = 1e5  # innovation variance of a whitened row
@@ -95,15 +96,15 @@ class Found(NamedTuple):
 def _exp(x, sign, out):  # type: ignore[no-untyped-def]
     """out = Exp(sign x)."""
     t2 = x[0] ** 2 + x[1] ** 2 + x[2] ** 2
-    b, c, _, _ = _jr_coefficients(t2)
-    _polynomial(x, 1.0, sign * (1 - c * t2), b, out)
+    b, c, _, _ = jr_coefficients(t2)
+    polynomial(x, 1.0, sign * (1 - c * t2), b, out)
 
 
 @njit(cache=True)
 def _right(x, out):  # type: ignore[no-untyped-def]
     """out = Jr(x)."""
-    b, c, _, _ = _jr_coefficients(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
-    _polynomial(x, 1.0, -b, c, out)
+    b, c, _, _ = jr_coefficients(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
+    polynomial(x, 1.0, -b, c, out)
 
 
 @njit(cache=True)
@@ -161,30 +162,30 @@ def _inertial(h, w, zeta, R, R_next, S, at, F, Q, work):  # type: ignore[no-unty
     _right(theta, Jr)
     _exp(theta, -1.0, Et)
     _exp(turn, 1.0, C)
-    _polynomial(w, 0.0, 1.0, 0.0, W)
+    polynomial(w, 0.0, 1.0, 0.0, W)
     for i in range(9):
         F[at + i, at + i] = 0.0
     _put(Et, 1.0, at, at, F)
     _put(Et, 1.0, at + 3, at + 3, F)
     _put(C, 1.0, at + 6, at + 6, F)
-    _mul(C, W, X)
+    mul(C, W, X)
     _put(X, -h, at + 6, at + 6, F)
-    _mul(W, R, Y)
-    _mul(X, Y, A)  # C W W R
+    mul(W, R, Y)
+    mul(X, Y, A)  # C W W R
     _put(A, -h, at + 6, at + 3, F)
-    _mul(C, R, CR)
-    _mul(C, Y, CWR)
-    _mul(Et, R.T, X)
+    mul(C, R, CR)
+    mul(C, Y, CWR)
+    mul(Et, R.T, X)
     _put(X, h, at + 3, at + 6, F)
-    _mul(X, Y, A)  # E' R' W R
+    mul(X, Y, A)  # E' R' W R
     _put(A, h, at + 3, at + 3, F)
-    _polynomial(p, 0.0, 1.0, 0.0, X)
-    _mul(Et, X, A)
+    polynomial(p, 0.0, 1.0, 0.0, X)
+    mul(Et, X, A)
     _put(A, -1.0, at + 3, at, F)
-    _mul(CWR, X, A)
+    mul(CWR, X, A)
     _put(A, 1.0, at + 6, at, F)
-    _polynomial(v, 0.0, 1.0, 0.0, X)
-    _mul(CR, X, A)
+    polynomial(v, 0.0, 1.0, 0.0, X)
+    mul(CR, X, A)
     _put(A, -1.0, at + 6, at, F)
     for i in range(3):
         for j in range(3):
@@ -193,11 +194,11 @@ def _inertial(h, w, zeta, R, R_next, S, at, F, Q, work):  # type: ignore[no-unty
         for j in range(15):
             Q[at + i, at + j] = S[i, j]
     for j in range(15):
-        _apply(R_next, S[6:9, j], Q[at + 6 : at + 9, at + j])
+        apply(R_next, S[6:9, j], Q[at + 6 : at + 9, at + j])
     for i in range(15):
         for j in range(3):
             turn[j] = Q[at + i, at + 6 + j]
-        _apply(R_next, turn, Q[at + i, at + 6 : at + 9])
+        apply(R_next, turn, Q[at + i, at + 6 : at + 9])
 
 
 @njit(cache=True)
@@ -229,7 +230,7 @@ def _carry(m, u, k, z, x, to, F, Q):  # type: ignore[no-untyped-def]
         for j in range(6):
             change[j] = m.scale[u, j] + (z[m.number[u, j]] if m.number[u, j] >= 0 else 0.0)
         _sensors(m.by_scale[u, k], change, zeta[0])
-        _carry_along(m.dt_s[u, k : k + 1], zeta, m.gravitation_n[u, k : k + 1], m.w_ie_n[u], R, r, v)
+        carry_intervals(m.dt_s[u, k : k + 1], zeta, m.gravitation_n[u, k : k + 1], m.w_ie_n[u], R, r, v)
         _inertial(h, m.w_ie_n[u], zeta[0], R[0], R[1], m.Q[u, k], at, F, Q, work)
         _by_sensors(m.by_bias[u, k], columns[:6], at, F, work)
         _by_sensors(m.by_scale[u, k], columns[6:], at, F, work)
@@ -266,9 +267,9 @@ def _deviation(at, R, r, v, bias, R_at, r_at, v_at, bias_at, has_imu, d):  # typ
         for i in range(3):
             d[at + i], d[at + 3 + i] = x[i], v[i] - v_at[i]
         return
-    _mul(R_at.T, R, A)
+    mul(R_at.T, R, A)
     _log(A, d[at : at + 3])
-    _apply(R_at.T, x, d[at + 3 : at + 6])
+    apply(R_at.T, x, d[at + 3 : at + 6])
     for i in range(3):
         d[at + 6 + i] = v[i] - v_at[i]
         d[at + 9 + i], d[at + 12 + i] = bias[3 + i] - bias_at[3 + i], bias[i] - bias_at[i]
@@ -278,8 +279,8 @@ def _deviation(at, R, r, v, bias, R_at, r_at, v_at, bias_at, has_imu, d):  # typ
 def _to_predicted(at, x, H):  # type: ignore[no-untyped-def]
     """Columns by errors about where rows were evaluated become those by errors about a state turned by x from there."""
     A = np.empty((3, 3))
-    c, _ = _inverse_coefficients(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
-    _polynomial(x, 1.0, 0.5, c, A)
+    c, _ = inverse_coefficients(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
+    polynomial(x, 1.0, 0.5, c, A)
     _times(H, at, A)
     _exp(x, 1.0, A)
     _times(H, at + 3, A)
@@ -296,8 +297,8 @@ def _feed_back(dx, R, r, v, bias, R_to, r_to, v_to, bias_to, T, has_imu):  # typ
         return
     turn = dx[:3]
     _exp(turn, 1.0, E)
-    _mul(R, E, R_to)
-    _apply(R, dx[3:6], r_to)
+    mul(R, E, R_to)
+    apply(R, dx[3:6], r_to)
     for i in range(3):
         r_to[i], v_to[i] = r_to[i] + r[i], v[i] + dx[6 + i]
         bias_to[3 + i], bias_to[i] = bias[3 + i] + dx[9 + i], bias[i] + dx[12 + i]

@@ -32,6 +32,7 @@ from numba import njit
 
 from factorgraph.attitude import exp_so3, log_so3, right_jacobian, right_jacobian_inverse, skew
 from factorgraph.models.preintegration import GroupedInputs
+from factorgraph.models.small import apply, inverse_coefficients, jr_coefficients, mul, polynomial
 from factorgraph.types import Array
 
 STATE = 15  # columns of one state
@@ -65,55 +66,12 @@ class Intervals:
 
 
 @njit(cache=True)
-def _jr_coefficients(a2):  # type: ignore[no-untyped-def]
-    """b, c of Jr = I - b [x] + c [x]^2 and their derivatives by a, over a."""
-    if a2 < 1e-3:
-        b, c = 0.5 - a2 / 24 + a2 * a2 / 720, 1.0 / 6 - a2 / 120 + a2 * a2 / 5040
-        return b, c, -1.0 / 12 + a2 / 180 - a2 * a2 / 6720, -1.0 / 60 + a2 / 1260 - a2 * a2 / 60480
-    a = np.sqrt(a2)
-    s, m = np.sin(a), 1 - np.cos(a)
-    return m / a2, (a - s) / (a2 * a), (a * s - 2 * m) / (a2 * a2), (a * m - 3 * (a - s)) / (a2 * a2 * a)
-
-
-@njit(cache=True)
-def _inverse_coefficients(a2):  # type: ignore[no-untyped-def]
-    """c of Jr^-1 = I + [x] / 2 + c [x]^2 and its derivative by a, over a."""
-    if a2 < 1e-3:
-        return 1.0 / 12 + a2 / 720 + a2 * a2 / 30240, 1.0 / 360 + a2 / 7560 + a2 * a2 / 201600
-    a = np.sqrt(a2)
-    s, cot = np.sin(a / 2), 1 / np.tan(a / 2)
-    return 1 / a2 - cot / (2 * a), (-2 / a2 + cot / (2 * a) + 0.25 / (s * s)) / a2
-
-
-@njit(cache=True)
-def _polynomial(x, a, b, c, out):  # type: ignore[no-untyped-def]
-    """out = a I + b [x] + c [x]^2."""
-    x0, x1, x2 = x[0], x[1], x[2]
-    out[0, 0], out[0, 1], out[0, 2] = a - c * (x1 * x1 + x2 * x2), c * x0 * x1 - b * x2, c * x0 * x2 + b * x1
-    out[1, 0], out[1, 1], out[1, 2] = c * x0 * x1 + b * x2, a - c * (x0 * x0 + x2 * x2), c * x1 * x2 - b * x0
-    out[2, 0], out[2, 1], out[2, 2] = c * x0 * x2 - b * x1, c * x1 * x2 + b * x0, a - c * (x0 * x0 + x1 * x1)
-
-
-@njit(cache=True)
-def _apply(A, x, out):  # type: ignore[no-untyped-def]
-    for i in range(3):
-        out[i] = A[i, 0] * x[0] + A[i, 1] * x[1] + A[i, 2] * x[2]
-
-
-@njit(cache=True)
-def _mul(A, B, out):  # type: ignore[no-untyped-def]
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
-
-
-@njit(cache=True)
 def _squared_by(x, y, b, c, db, dc, out):  # type: ignore[no-untyped-def]
     """out = d(b(|x|) x x y + c(|x|) x x (x x y)) / dx with y constant; db, dc derivatives by |x|, over |x|."""
     z0, z1, z2 = x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
     q0, q1, q2 = x[1] * z2 - x[2] * z1, x[2] * z0 - x[0] * z2, x[0] * z1 - x[1] * z0
     xy = x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
-    _polynomial(y, c * xy, -b, 0.0, out)
+    polynomial(y, c * xy, -b, 0.0, out)
     for j in range(3):
         out[0, j] += c * (x[0] * y[j] - 2 * y[0] * x[j]) + (db * z0 + dc * q0) * x[j]
         out[1, j] += c * (x[1] * y[j] - 2 * y[1] * x[j]) + (db * z1 + dc * q1) * x[j]
@@ -153,19 +111,19 @@ def _preintegrate(first, f, w, h_s, bias, gyro, accel, walks, integration, facto
                 a[i], wc[i] = f[k, i] - bias[n, 3 + i], w[k, i] - bias[n, i]
                 theta[i] = z[i]
             t2 = theta[0] ** 2 + theta[1] ** 2 + theta[2] ** 2
-            b, c, db, dc = _jr_coefficients(t2)
-            ci, _ = _inverse_coefficients(t2)
-            _polynomial(theta, 1.0, -b, c, D)
-            _polynomial(theta, 1.0, 0.5, ci, inv)
-            _polynomial(theta, 1.0, 1 - c * t2, b, R)
-            _apply(inv, wc, wt)
-            _apply(R, a, av)
+            b, c, db, dc = jr_coefficients(t2)
+            ci, _ = inverse_coefficients(t2)
+            polynomial(theta, 1.0, -b, c, D)
+            polynomial(theta, 1.0, 0.5, ci, inv)
+            polynomial(theta, 1.0, 1 - c * t2, b, R)
+            apply(inv, wc, wt)
+            apply(R, a, av)
             # d(Jr^-1 w) / d theta = -Jr^-1 d(Jr wt) / d theta
             _squared_by(theta, wt, -b, c, -db, dc, M)
-            _mul(inv, M, N)
-            _polynomial(a, 0.0, -1.0, 0.0, M)
-            _mul(R, M, At)
-            _mul(At, D, M)
+            mul(inv, M, N)
+            polynomial(a, 0.0, -1.0, 0.0, M)
+            mul(R, M, At)
+            mul(At, D, M)
             for i in range(3):
                 for j in range(3):
                     At[i, j] = (1.0 if i == j else 0.0) - h * N[i, j]
@@ -299,25 +257,25 @@ def carry(
 
 
 @njit(cache=True)
-def _carry_along(dt, zeta, g, w, R, r, v):  # type: ignore[no-untyped-def]
+def carry_intervals(dt, zeta, g, w, R, r, v):  # type: ignore[no-untyped-def]
     """Fill states 1 to n of R (n + 1, 3, 3), r, v (n + 1, 3) from state 0, one interval after the other."""
     E, T, A, W = np.empty((4, 3, 3))
-    _polynomial(w, 0.0, 1.0, 0.0, W)
+    polynomial(w, 0.0, 1.0, 0.0, W)
     turn, Wr, Wg, WWg, a, b = np.empty((6, 3))
     for k in range(len(dt)):
         h = dt[k]
         theta = zeta[k, :3]
         t2 = theta[0] ** 2 + theta[1] ** 2 + theta[2] ** 2
-        jb, jc, _, _ = _jr_coefficients(t2)
-        _polynomial(theta, 1.0, 1 - jc * t2, jb, E)
+        jb, jc, _, _ = jr_coefficients(t2)
+        polynomial(theta, 1.0, 1 - jc * t2, jb, E)
         for i in range(3):
             turn[i] = -h * w[i]
         t2 = turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2
-        jb, jc, _, _ = _jr_coefficients(t2)
-        _polynomial(turn, 1.0, 1 - jc * t2, jb, T)
-        _apply(W, r[k], Wr)
-        _apply(W, g[k], Wg)
-        _apply(W, Wg, WWg)
+        jb, jc, _, _ = jr_coefficients(t2)
+        polynomial(turn, 1.0, 1 - jc * t2, jb, T)
+        apply(W, r[k], Wr)
+        apply(W, g[k], Wg)
+        apply(W, Wg, WWg)
         for i in range(3):
             p = q = 0.0
             for j in range(3):
@@ -325,13 +283,13 @@ def _carry_along(dt, zeta, g, w, R, r, v):  # type: ignore[no-untyped-def]
                 q += R[k, i, j] * zeta[k, 6 + j]
             a[i] = r[k, i] + (v[k, i] + Wr[i]) * h + p + h * h * (g[k, i] / 2 + h * Wg[i] / 6 + h * h * WWg[i] / 24)
             b[i] = v[k, i] + Wr[i] + q + h * (g[k, i] + h * Wg[i] / 2 + h * h * WWg[i] / 6)
-        _apply(W, a, Wr)
+        apply(W, a, Wr)
         for i in range(3):
             b[i] -= Wr[i]
-        _mul(R[k], E, A)
-        _mul(T, A, R[k + 1])
-        _apply(T, a, r[k + 1])
-        _apply(T, b, v[k + 1])
+        mul(R[k], E, A)
+        mul(T, A, R[k + 1])
+        apply(T, a, r[k + 1])
+        apply(T, b, v[k + 1])
 
 
 def carry_along(
@@ -348,7 +306,7 @@ def carry_along(
     Everything else as in `evaluate`; each step is that of `carry`.
     """
     zeta = _corrected(part, np.broadcast_to(bias, at_bias.shape), at_bias, scale)
-    _carry_along(part.dt_s, zeta, gravitation_n, w_ie_n, states.R, states.r_n, states.v_n)
+    carry_intervals(part.dt_s, zeta, gravitation_n, w_ie_n, states.R, states.r_n, states.v_n)
 
 
 def _residuals(states: States, zeta: Array, dt: Array, g: Array, w_ie: Array) -> tuple[Array, Array, Array]:

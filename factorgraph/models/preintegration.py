@@ -20,6 +20,7 @@ import numpy as np
 from numba import njit
 
 from factorgraph.measurements import ImuStream
+from factorgraph.models.small import mul, polynomial, rotation_coefficients
 from factorgraph.types import Array, BoolArray, IntArray
 
 PAIR_S = 0.1  # two GTSAM steps
@@ -41,32 +42,6 @@ class Increments:
     dp_dbg: Array
     dp_dba: Array
     w_b: Array  # (n, 3) angular rate at the end, bias not removed
-
-
-@njit(cache=True)
-def _mul(A, B, C):  # type: ignore[no-untyped-def]
-    """C = A B for 3 x 3, C distinct from both."""
-    for i in range(3):
-        for j in range(3):
-            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
-
-
-@njit(cache=True)
-def _polynomial(v, a, b, c, C):  # type: ignore[no-untyped-def]
-    """C = a I + b [v x] + c [v x]^2."""
-    x, y, z = v[0], v[1], v[2]
-    C[0, 0], C[0, 1], C[0, 2] = a - c * (y * y + z * z), c * x * y - b * z, c * x * z + b * y
-    C[1, 0], C[1, 1], C[1, 2] = c * x * y + b * z, a - c * (x * x + z * z), c * y * z - b * x
-    C[2, 0], C[2, 1], C[2, 2] = c * x * z - b * y, c * y * z + b * x, a - c * (x * x + y * y)
-
-
-@njit(cache=True)
-def _rotation_coefficients(a2):  # type: ignore[no-untyped-def]
-    """sin a / a, (1 - cos a) / a^2, (a - sin a) / a^3."""
-    if a2 < 1e-8:
-        return 1 - a2 / 6, 0.5 - a2 / 24, 1.0 / 6 - a2 / 120
-    a = np.sqrt(a2)
-    return np.sin(a) / a, (1 - np.cos(a)) / a2, (a - np.sin(a)) / (a2 * a)
 
 
 @njit(cache=True)
@@ -107,31 +82,31 @@ def _integrate(edges, f, w, start, stop, bias, dt_out, dR_out, dv_out, dp_out, J
                     wk[c], fk[c] = w[k, c] - bias[i, c], f[k, c] - bias[i, 3 + c]
                     phi[c] = wk[c] * h
                     a2 += phi[c] * phi[c]
-                s1, s2, s3 = _rotation_coefficients(a2)
-                _polynomial(phi, 1.0, s1, s2, E)
-                _polynomial(wk, h, h * h / 2, h**3 / 6, A1)
-                _polynomial(wk, h * h / 2, h**3 / 6, h**4 / 24, A2)
+                s1, s2, s3 = rotation_coefficients(a2)
+                polynomial(phi, 1.0, s1, s2, E)
+                polynomial(wk, h, h * h / 2, h**3 / 6, A1)
+                polynomial(wk, h * h / 2, h**3 / 6, h**4 / 24, A2)
                 for c in range(3):
                     av[c] = A1[c, 0] * fk[0] + A1[c, 1] * fk[1] + A1[c, 2] * fk[2]
                     ap[c] = A2[c, 0] * fk[0] + A2[c, 1] * fk[1] + A2[c, 2] * fk[2]
                 if jacobians:
                     # positions before velocities, both before the rotation; d(A f)/dw f to leading order is enough here
-                    _polynomial(phi, 1.0, -s2, s3, Jr)
-                    _polynomial(fk, 0.0, 1.0, 0.0, F)
-                    _mul(dR, F, T)
-                    _polynomial(ap, 0.0, 1.0, 0.0, M)
-                    _mul(dR, M, N)
-                    _mul(N, J[0], M)
+                    polynomial(phi, 1.0, -s2, s3, Jr)
+                    polynomial(fk, 0.0, 1.0, 0.0, F)
+                    mul(dR, F, T)
+                    polynomial(ap, 0.0, 1.0, 0.0, M)
+                    mul(dR, M, N)
+                    mul(N, J[0], M)
                     _add(J[3], J[1], h, M, T, h**3 / 6)
-                    _mul(dR, A2, M)
+                    mul(dR, A2, M)
                     _add(J[4], J[2], h, M, T, 0.0)
-                    _polynomial(av, 0.0, 1.0, 0.0, M)
-                    _mul(dR, M, N)
-                    _mul(N, J[0], M)
+                    polynomial(av, 0.0, 1.0, 0.0, M)
+                    mul(dR, M, N)
+                    mul(N, J[0], M)
                     _add(J[1], T, h * h / 2, M, T, 0.0)
-                    _mul(dR, A1, M)
+                    mul(dR, A1, M)
                     _add(J[2], T, 0.0, M, T, 0.0)
-                    _mul(E.T, J[0], M)
+                    mul(E.T, J[0], M)
                     for c in range(3):
                         for d in range(3):
                             J[0, c, d] = M[c, d] - Jr[c, d] * h
@@ -139,7 +114,7 @@ def _integrate(edges, f, w, start, stop, bias, dt_out, dR_out, dv_out, dp_out, J
                     dp[c] += dv[c] * h + dR[c, 0] * ap[0] + dR[c, 1] * ap[1] + dR[c, 2] * ap[2]
                 for c in range(3):
                     dv[c] += dR[c, 0] * av[0] + dR[c, 1] * av[1] + dR[c, 2] * av[2]
-                _mul(dR, E, M)
+                mul(dR, E, M)
                 dR[:] = M
             t = end
             if k < n_samples - 1 and t >= edges[k + 1]:
@@ -257,8 +232,8 @@ def _tangent_inputs(first, dt_s, dR, dv, dp, w_eff, a_eff, dt):  # type: ignore[
         a_eff[i], a_eff[i + 1] = R0.T @ (Q - 0.5 * S), dR[i].T @ (1.5 * S - Q)
         for k in range(2):
             th1 = _log(dR[i + k])
-            _, s2, s3 = _rotation_coefficients(th0[0] ** 2 + th0[1] ** 2 + th0[2] ** 2)
-            _polynomial(th0, 1.0, -s2, s3, Jr)
+            _, s2, s3 = rotation_coefficients(th0[0] ** 2 + th0[1] ** 2 + th0[2] ** 2)
+            polynomial(th0, 1.0, -s2, s3, Jr)
             dt[i + k] = h
             w_eff[i + k] = Jr @ (th1 - th0) / h
             th0 = th1
