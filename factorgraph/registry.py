@@ -46,6 +46,7 @@ OURS = (
     ("graph", f"{GRAPHS}batch:Batch", "GTSAM factor graph over the whole flight"),
     ("least-squares", f"{LEAST_SQUARES}batch:Batch", "CasADi least squares over the whole flight"),
     ("moving-horizon", f"{LEAST_SQUARES}horizon:Horizon", "least squares over a sliding window, epoch by epoch"),
+    ("eskf-passes", f"{FILTERS}passes:InPasses", "error-state Kalman filter in passes, without robust losses: for many flights"),
     ("ieks", f"{FILTERS}recursive:IteratedSmoother", "iterated Kalman smoother: the optimum of the whole flight by filters"),
     *((name, f"{FILTERS}methods:{name}", summary) for name, summary in RECURSIVE.items()),
     *((f"{name}-rts", f"{FILTERS}methods:{name}-rts", f"{summary}, smoothed") for name, summary in RECURSIVE.items()),

@@ -10,7 +10,7 @@ Source: Bell (1994), The iterated Kalman smoother as a Gauss-Newton method.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from factorgraph.assembly.engine import Linear
 from factorgraph.assembly.optimizer import Graph
 from factorgraph.filters import kalman, smoother
 from factorgraph.filters.sequential import Stages
+from factorgraph.solution import Solution
 from factorgraph.types import Array, IntArray
 
 
@@ -196,3 +197,11 @@ class Kept:
     def eliminate(self, lam: float) -> Solved:
         """No step is left to take."""
         return Solved(self.track, [np.zeros(len(stage.dx)) for stage in self.track.course])
+
+
+def with_innovations(solution: Solution, track: Track) -> Solution:
+    """A filter's solution with the NIS of its innovations."""
+    nis, dof = np.array([c.nis for c in track.course]), np.array([c.dof for c in track.course])
+    seen = dof > 0
+    of_filter = replace(solution.diagnostics, nis_t_s=track.stages.t_s[seen], nis=nis[seen], nis_dof=dof[seen])
+    return replace(solution, diagnostics=of_filter)

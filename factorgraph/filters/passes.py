@@ -24,19 +24,24 @@ Source: Bell (1994) for passes as iterations; Bierman (1977) for scalar updates;
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from factorgraph.assembly.blocks import KINDS, EndsBlock
-from factorgraph.assembly.optimizer import Graph
+from factorgraph.assembly.flight import WholeFlight
+from factorgraph.assembly.optimizer import Graph, Result
+from factorgraph.assembly.result import make_solution
 from factorgraph.filters._scan import Found, Layout, Motion, Points, scan
-from factorgraph.filters.course import Stage, Track
+from factorgraph.filters.course import ChainEngine, Stage, Track, with_innovations
 from factorgraph.filters.sequential import Stages
 from factorgraph.models.robust import Loss
 from factorgraph.models.robust import weight as robust_weight
-from factorgraph.problem import Robust
+from factorgraph.problem import NavigationProblem, Robust
+from factorgraph.registry import Progress
+from factorgraph.solution import Solution, Status
 from factorgraph.types import Array, BoolArray, IntArray
 
 PASSES = 15
@@ -369,3 +374,26 @@ def _fill(track: Track, gathered: _Gathered, has_imu: BoolArray, found: Found, w
         F = found.F[steps[k] : steps[k + 1]].reshape(n, -1)
         dx = found.dx[columns[k] : columns[k + 1]]
         track.course.append(Stage(dx, P, T[k], prior, F, Q, float(found.nis[k]), float(dof[k])))
+
+
+class InPasses:
+    """The error-state filter in passes as a method: without robust losses, ambiguities float."""
+
+    summary = "error-state Kalman filter in passes over the whole flight"
+
+    def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
+        """Solve a problem. Raises InputError for what cannot be estimated."""
+        built, notes, spent = WholeFlight("eskf-passes", ChainEngine).started(problem, progress)
+        began = time.perf_counter()
+        track = filtered(built.graph, lambda f: progress("filter", 0.3 + 0.6 * f))
+        spent["eskf-passes"] = time.perf_counter() - began
+        graph = built.graph
+        graph.assemble()
+        graph.engine = ChainEngine(track)
+        graph.predict()
+        for number, y in track.y.items():
+            graph.blocks[number].y = y
+        solution = make_solution(
+            problem, "eskf-passes", built, Result(Status.CONVERGED, [0.0]), np.nan, spent, notes + track.notes
+        )
+        return with_innovations(solution, track)

@@ -28,7 +28,7 @@ from factorgraph.filters import kalman, updates
 from factorgraph.filters.charts import BODY, Chart
 from factorgraph.filters.clouds import Cloud
 from factorgraph.filters.correctors import Corrector
-from factorgraph.filters.course import ChainEngine, Stage, Track, joint, smooth_values
+from factorgraph.filters.course import ChainEngine, Stage, Track, joint, smooth_values, with_innovations
 from factorgraph.filters.sequential import StageRows, Stages
 from factorgraph.filters.sigma_points import Rule, root, rooted
 from factorgraph.filters.updates import Linearise, Updated
@@ -393,14 +393,10 @@ def hand_out(graph: Graph, found: Run, smoothed: bool) -> None:
 
 def finished(solution: Solution, found: Run, smoothed: bool) -> Solution:
     """A filter's NIS is that of its innovations, a smoothed flight's that of its residuals; and whether it went wrong."""
-    d, course = solution.diagnostics, found.track.course
     if found.watch.trouble:
-        d = replace(d, warnings=(*d.warnings, found.watch.trouble))
-    if not smoothed:
-        nis, dof = np.array([c.nis for c in course]), np.array([c.dof for c in course])
-        seen = dof > 0
-        d = replace(d, nis_t_s=found.s.t_s[seen], nis=nis[seen], nis_dof=dof[seen])
-    return replace(solution, diagnostics=d)
+        d = solution.diagnostics
+        solution = replace(solution, diagnostics=replace(d, warnings=(*d.warnings, found.watch.trouble)))
+    return solution if smoothed else with_innovations(solution, found.track)
 
 
 class IteratedSmoother:

@@ -89,10 +89,9 @@ def _least_squares(problem: NavigationProblem, scale: float) -> None:
         assert isinstance(solution, Solution)
         spent = solution.diagnostics.runtime_s
         print("  of it " + ", ".join(f"{stage} {s:.2f} s" for stage, s in spent.items()))
-    iterating = spent["float solution"]
-    print(
-        f"  float solution from its start values {iterating:.2f} s   target {2 * scale:g} s: {'met' if iterating <= 2 * scale else 'MISSED'}"
-    )
+    iterating, target = spent["float solution"], 2 * scale
+    verdict = "met" if iterating <= target else "MISSED"
+    print(f"  float solution from its start values {iterating:.2f} s   target {target:g} s: {verdict}")
     built, _, _ = WholeFlight("moving-horizon", StageEngine).started(problem, lambda stage, fraction: None)
     window = MovingHorizon(built.graph, HorizonSettings(), problem.settings.robust, problem.settings.ambiguity)
     steps_ms = 1e3 * np.array([window.step().spent_s for _ in range(min(200, len(window.t_s)))])[30:]

@@ -20,7 +20,7 @@ from factorgraph.registry import solve
 from factorgraph.solution import Status
 from factorgraph.types import Array
 from tests.factorgraph.test_agreement import LINEAR_TO, linear_problem
-from tests.factorgraph.test_batch_simulation import IMU, PAIR, WITH_BASE, flight_of
+from tests.factorgraph.test_batch_simulation import IMU, PAIR, WITH_BASE, flight_of, pair_flight, relative, true_baseline
 
 
 def quiet(stage: str, fraction: float) -> None:
@@ -157,3 +157,13 @@ def test_robust_weights_hold_gross_errors_off(kernel: str, width: float) -> None
 def test_passes_that_do_not_settle_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(passes, "PASSES", 1)
     assert "after 1 passes" in passes.filtered(flight("motion")).notes[0]
+
+
+def test_the_method_ends_where_the_vehicles_are() -> None:
+    flight, _ = pair_flight(1.0, 10)
+    solution = solve(flight.problem, "eskf-passes")
+    pair = solution.pair("a", "b")
+    error = relative(solution, "a", "b")[0] - true_baseline(flight, pair)[0]
+    assert np.all(np.abs(error[-1]) < 4 * np.sqrt(np.diagonal(pair.P[-1])[:3]))
+    nis = solution.diagnostics
+    assert 0.9 < nis.nis.sum() / nis.nis_dof.sum() < 1.1
