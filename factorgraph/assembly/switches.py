@@ -31,11 +31,10 @@ OPEN = 0.5  # weight below which an integer counts as refused
 
 
 @dataclass(slots=True)
-class SwitchBlock(Block):
-    """Constraints of a link's ambiguities to their integers, one row each."""
+class HeldBlock(Block):
+    """Constraints of a link's ambiguities to integers."""
 
     of: GnssBlock
-    arc: IntArray  # (n,)
     integer: Array  # (n,)
     valid_for: IntArray  # the keys of the link's ambiguities; others once its arcs are made anew
 
@@ -46,6 +45,13 @@ class SwitchBlock(Block):
     @property
     def version(self) -> tuple[int, ...]:
         return (self.of.structure, int(self.active.sum()))
+
+
+@dataclass(slots=True)
+class SwitchBlock(HeldBlock):
+    """Constraints of single ambiguities, one row each, that their phases may switch off."""
+
+    arc: IntArray  # (n,)
 
     def keys(self, f: int) -> list[int]:
         return [int(self.of.amb_key[self.arc[f]])]

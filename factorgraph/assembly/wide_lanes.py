@@ -17,11 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambiguity import partial
-from factorgraph.assembly.blocks import CODE, PHASE, Block, GnssBlock
+from factorgraph.assembly.blocks import CODE, PHASE, GnssBlock
 from factorgraph.assembly.build import GnssLink
 from factorgraph.assembly.engine import Eliminated
 from factorgraph.assembly.optimizer import Graph
 from factorgraph.assembly.rows import plain_rows
+from factorgraph.assembly.switches import HeldBlock
 from factorgraph.models.combinations import melbourne_wuebbena
 from factorgraph.problem import AmbiguitySettings
 from factorgraph.types import Array, BoolArray, IntArray
@@ -33,22 +34,11 @@ SAME_M = 1e-6  # wavelengths that differ by less are of one band
 
 
 @dataclass(slots=True)
-class WideLaneBlock(Block):
+class WideLaneBlock(HeldBlock):
     """Constraints first - second = integer between ambiguities of a link, one row each."""
 
-    of: GnssBlock
     first: IntArray  # (n,) arcs
     second: IntArray
-    integer: Array  # (n,)
-    valid_for: IntArray  # the keys of the link's ambiguities; others once its arcs are made anew
-
-    @property
-    def is_stale(self) -> bool:
-        return self.valid_for is not self.of.amb_key
-
-    @property
-    def version(self) -> tuple[int, ...]:
-        return (self.of.structure, int(self.active.sum()))
 
     @property
     def pairs(self) -> list[tuple[int, int]]:

@@ -45,3 +45,18 @@ def relnav(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) 
         return Run(code, err.splitlines(), printed, out)
 
     return run
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    """A flight folder with one vehicle and twenty position fixes."""
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    rows = [f"{t},{1.5 * t},{0.1 * t * t},2.0" for t in range(20)]
+    (folder / "fixes.csv").write_text("t,x,y,z\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    (folder / "flight.toml").write_text(
+        '[flight]\nname = "walk"\nt0 = "2021-09-22T06:30:00"\norigin = { lat_deg = 35.0, lon_deg = 139.0 }\n'
+        '[[vehicle]]\nname = "walker"\n[[vehicle.positions]]\nfile = "fixes.csv"\n',
+        encoding="utf-8",
+    )
+    return folder
