@@ -51,8 +51,11 @@ def posterior_bound(problem: NavigationProblem, integers_known: bool = True) -> 
             raise InputError(f"the bound needs the true position, velocity and attitude of {v.name}")
         v.r, v.v = interpolate(grid, truth.t_s, truth.r_n), interpolate(grid, truth.t_s, truth.v_n)
         if truth.q_nb is not None:
-            near = np.clip(np.searchsorted(truth.t_s, grid - 1e-6), 0, len(truth.t_s) - 1)
-            v.R = matrix_from_quat(truth.q_nb[near])
+            after = np.clip(np.searchsorted(truth.t_s, grid), 1, max(len(truth.t_s) - 1, 1))
+            near = np.where(
+                grid - truth.t_s[after - 1] < truth.t_s[np.minimum(after, len(truth.t_s) - 1)] - grid, after - 1, after
+            )
+            v.R = matrix_from_quat(truth.q_nb[np.minimum(near, len(truth.t_s) - 1)])
     built = build(problem, vehicles, receivers(problem), use_phase=True, engine=StageEngine())
     for data in built.links:
         phases.prepare(data, problem.settings.ambiguity)

@@ -156,7 +156,9 @@ def _outcome(part: Part, args: argparse.Namespace, print_of: str, stages: Stages
     (part.folder / RUN).unlink(missing_ok=True)
     if args.warm:
         with tempfile.TemporaryDirectory(prefix="relnav-") as folder:
-            _watched(Part(part.method, Path(folder)), args, 1, stages, f"{title}, warming up")
+            code, _ = _watched(Part(part.method, Path(folder)), args, 1, stages, f"{title}, warming up")
+        if code == guard.INTERRUPTED:
+            raise KeyboardInterrupt
     code, reason = _watched(part, args, args.repeat, stages, title)
     if code == guard.INTERRUPTED:
         raise KeyboardInterrupt
@@ -233,7 +235,8 @@ def _bound(problem: NavigationProblem, args: argparse.Namespace, print_of: str, 
     if any(v.imu is not None and (v.truth is None or v.truth.q_nb is None) for v in moving):
         return None
     part = Part(BOUND, args.out / BOUND_FOLDER)
-    if _told(part.folder / RUN).get("fingerprint") != print_of or args.force:
+    told, file = _told(part.folder / RUN), part.folder / "bound.npz"
+    if (told.get("fingerprint"), told.get("relnav")) != (print_of, relnav_version()) or not file.exists() or args.force:
         (part.folder / RUN).unlink(missing_ok=True)
         code, reason = _watched(part, args, 1, stages, "bound")
         if code == guard.INTERRUPTED:
@@ -241,7 +244,7 @@ def _bound(problem: NavigationProblem, args: argparse.Namespace, print_of: str, 
         if code != guard.DONE:
             stages.say(f"bound: not known: {reason}")
             return None
-    with np.load(part.folder / "bound.npz", allow_pickle=False) as arrays:
+    with np.load(file, allow_pickle=False) as arrays:
         pairs = {(p.reference, p.rover): arrays[f"P{i}"] for i, p in enumerate(problem.wanted_pairs)}
         return arrays["t_s"], pairs
 

@@ -26,12 +26,12 @@ FILES = {
 
 @cache
 def solved(name: str, is_robust: bool) -> Solution:
-    """As the flight declares it; or, for comparison and by the faster method, without robust losses of GNSS."""
+    """As the flight declares it, or without robust losses of GNSS; by the faster of the two methods that agree."""
     problem = load(name, shared_data(FILES[name]).parent.parent).problem
     if not is_robust:
         plain: Mapping[str, Robust] = {"code": Robust("none"), "doppler": Robust("none")}
         problem = replace(problem, settings=replace(problem.settings, robust={**problem.settings.robust, **plain}))
-    return solve(problem, "graph" if is_robust else "least-squares")
+    return solve(problem, "least-squares")
 
 
 def horizontal(solution: Solution) -> Array:

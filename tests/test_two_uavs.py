@@ -1,6 +1,6 @@
 """The figure that sums up the toolkit: twenty simulated flights of two UAVs against truth and the Cramer-Rao bound.
 
-Five minutes each, to be quick; the README has the figures of ten.
+200 s each, to be quick; the README has the figures of ten minutes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ SEEDS = range(1, 21)
 
 @pytest.fixture(scope="module")
 def trials() -> studies.Trials:
-    return studies.run("two-uav", SEEDS, workers=2, duration_s=300.0)
+    return studies.run("two-uav", SEEDS, workers=2, duration_s=200.0)
 
 
 @pytest.mark.slow

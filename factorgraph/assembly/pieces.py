@@ -19,6 +19,7 @@ from factorgraph.assembly.nodes import Nodes
 from factorgraph.assembly.priors import MotionBlock
 from factorgraph.assembly.sensors import Measured, VectorBlock
 from factorgraph.assembly.variables import Query
+from factorgraph.errors import InputError
 from factorgraph.models.differencing import CommonGroups
 from factorgraph.models.preintegration import Increments
 from factorgraph.types import IntArray
@@ -138,11 +139,14 @@ class Staged:
     def of(cls, block: EndsBlock) -> Staged:
         entries = block.entries()
         k = np.array([end.query.k[entries] for end in block.ends() if end.vehicle.mode != "fixed"])
-        return cls(block, k.min(axis=0), k.max(axis=0))
+        first, last = k.min(axis=0), k.max(axis=0)
+        if np.any(np.diff(last) < 0):
+            raise InputError(f"{block.rows.source}: rows are not in the order of their states")
+        return cls(block, first, last)
 
     def between(self, a: int, b: int) -> EndsBlock | None:
         """Its factors that see states a to b and no others."""
         f0, f1 = (int(f) for f in np.searchsorted(self.last, [a, b + 1]))
-        while f0 < f1 and self.first[f0] < a:  # those that also see a state before are rare and come first
-            f0 += 1
+        early = np.flatnonzero(self.first[f0:f1] < a)  # also see a state before: rare, and among the first
+        f0 += int(early[-1]) + 1 if len(early) else 0
         return sliced(self.block, f0, f1) if f0 < f1 else None

@@ -63,6 +63,8 @@ class StrongTracking(Corrector):
         self.state = Fading()
 
     def inflation(self, P: Array, moved: Array, Q: Array, rows: StageRows, e: Array) -> Array:
+        if rows.dof <= 0:
+            return moved + Q
         H = rows.H
         HQH, HPH = (float(np.einsum("mi,ij,mj->", H, X, H, optimize=True)) for X in (Q, moved))
         factor, self.state = self.state.step(e, HQH, HPH, float(max(rows.dof, 1)))

@@ -16,9 +16,10 @@ import numpy as np
 
 from factorgraph.assembly.blocks import Block
 from factorgraph.assembly.engine import Linear
+from factorgraph.assembly.flight import OFFSET_S, REBIAS
 from factorgraph.assembly.optimizer import Graph
 from factorgraph.filters import kalman, smoother
-from factorgraph.filters.sequential import Stages
+from factorgraph.filters.sequential import Stages, usable
 from factorgraph.solution import Solution
 from factorgraph.types import Array, IntArray
 
@@ -45,7 +46,9 @@ class Track:
     course: list[Stage] = field(default_factory=list)
     y: dict[int, Array] = field(default_factory=dict)  # block -> residuals (n,) that updates left
     w: dict[int, Array] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    unsettled: float | None = (
+        None  # how far predictions still moved, in standard deviations, where passes ended before they stayed
+    )
 
 
 def joint(s: Stages, live: Sequence[int], k: int, F: Array | None, Q: Array | None) -> tuple[Array, Array]:
@@ -172,8 +175,9 @@ class ChainEngine:
 
     packages: tuple[str, ...] = ()
 
-    def __init__(self, track: Track | None = None) -> None:
+    def __init__(self, track: Track | None = None, left_out: list[str] | None = None) -> None:
         self.track = track  # in place of what would be solved for again
+        self.left_out = [] if left_out is None else left_out  # told what the chain cannot see
 
     def predict(self, block: Block) -> None:
         """Set the block's y and J at the current variables."""
@@ -181,7 +185,14 @@ class ChainEngine:
 
     def linearise(self, graph: Graph, joints: bool) -> Linear:
         """The problem as the blocks hold it, or what was found already; states of one time are together anyway."""
-        return Chain(graph) if self.track is None else Kept(self.track)
+        if self.track is not None:
+            return Kept(self.track)
+        for block in graph.blocks:
+            if not usable(block) and np.any(block.active):
+                block.active[:] = False  # what no step can follow must not count in the cost
+                block.reweight({})
+                self.left_out.append(f"{block.rows.source}: {len(block.rows.factor.start)} constraints between two times")
+        return Chain(graph)
 
     def remarks(self, graph: Graph) -> list[str]:
         """Nothing beside that it failed."""
@@ -205,3 +216,20 @@ def with_innovations(solution: Solution, track: Track) -> Solution:
     seen = dof > 0
     of_filter = replace(solution.diagnostics, nis_t_s=track.stages.t_s[seen], nis=nis[seen], nis_dof=dof[seen])
     return replace(solution, diagnostics=of_filter)
+
+
+def linear_in(s: Stages) -> list[str]:
+    """What the filter could not use, and what it was linear in that has moved far."""
+    notes = [f"left out: {what}" for what in s.left_out]
+    for v in s.vehicles:
+        if v.mode == "imu":
+            off = np.median(np.abs(v.bias - v.preintegrated_bias), axis=0)
+            if np.any(off > REBIAS):
+                notes.append(
+                    f"{v.name}: IMU increments belong to other biases (gyroscope {off[:3].max():.2g} rad/s, accelerometer"
+                    f" {off[3:].max():.2g} m/s^2 off) and were corrected to first order; the graph integrates them again"
+                )
+    moved = [p.name for p in s.parameters if p.unit == "s" and np.any(np.abs(p.value - p.prior) > OFFSET_S)]
+    if moved:
+        notes.append(f"time offsets applied by rates, not by attaching measurements to other states: {', '.join(moved)}")
+    return notes

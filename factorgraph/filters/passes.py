@@ -35,7 +35,7 @@ from factorgraph.assembly.flight import WholeFlight
 from factorgraph.assembly.optimizer import Graph, Result
 from factorgraph.assembly.result import make_solution
 from factorgraph.filters._scan import Found, Layout, Motion, Points, scan
-from factorgraph.filters.course import ChainEngine, Stage, Track, with_innovations
+from factorgraph.filters.course import ChainEngine, Stage, Track, linear_in, with_innovations
 from factorgraph.filters.sequential import Stages
 from factorgraph.models.robust import Loss
 from factorgraph.models.robust import weight as robust_weight
@@ -146,10 +146,15 @@ def _gather(s: Stages, processes: _Processes) -> _Gathered:
         mine = np.flatnonzero(alive)
         place = np.full(b.n, -1)
         place[mine] = done + np.arange(len(mine))
-        local = np.concatenate([s.place[key] + np.arange(c1 - c0) for key, (c0, c1) in zip(b.keys(0), b.edges(), strict=True)])
-        w = len(local)
+        table, w = b.key_table(), sum(b.widths())
+        local = np.empty((len(mine), w), np.int64)
+        for own, (c0, c1) in zip(table.T, b.edges(), strict=True):
+            if own[0] in s.place:  # of states, which have one place, and of parameters
+                local[:, c0:c1] = s.place[int(own[0])] + np.arange(c1 - c0)
+            else:
+                local[:, c0] = column_of(own[factor[mine]], each.stage[factor[mine]])
         of_entry.append(np.repeat(place[mine], w))
-        columns.append(np.tile(local, len(mine)))
+        columns.append(local.ravel())
         entries.append((base + mine[:, None] * w + np.arange(w)).ravel())
         base += b.n * w
         if (c := b.scalars()) is not None:
@@ -301,9 +306,7 @@ def filtered(graph: Graph, progress: Callable[[float], None] = lambda f: None, r
         if float(found.drift.max()) <= SETTLED and (turn > CONVEX or not robust):
             break
     else:
-        track.notes.append(
-            f"predictions still moved by {found.drift.max():.2g} of their standard deviations after {PASSES} passes"
-        )
+        track.unsettled = float(found.drift.max())
     _place(s, found.filtered)
     s.move_parameters(found.z[gathered.layout.first_column[-2] :])
     for key, value in zip(sorted(s.scalars), found.z[gathered.last].tolist(), strict=True):
@@ -377,7 +380,7 @@ def _fill(track: Track, gathered: _Gathered, has_imu: BoolArray, found: Found, w
 
 
 class InPasses:
-    """The error-state filter in passes as a method: without robust losses, ambiguities float."""
+    """The error-state filter in passes as a method; ambiguities stay float."""
 
     summary = "error-state Kalman filter in passes over the whole flight"
 
@@ -385,7 +388,7 @@ class InPasses:
         """Solve a problem. Raises InputError for what cannot be estimated."""
         built, notes, spent = WholeFlight("eskf-passes", ChainEngine).started(problem, progress)
         began = time.perf_counter()
-        track = filtered(built.graph, lambda f: progress("filter", 0.3 + 0.6 * f))
+        track = filtered(built.graph, lambda f: progress("filter", 0.3 + 0.6 * f), problem.settings.robust)
         spent["eskf-passes"] = time.perf_counter() - began
         graph = built.graph
         graph.assemble()
@@ -393,7 +396,10 @@ class InPasses:
         graph.predict()
         for number, y in track.y.items():
             graph.blocks[number].y = y
-        solution = make_solution(
-            problem, "eskf-passes", built, Result(Status.CONVERGED, [0.0]), np.nan, spent, notes + track.notes
-        )
-        return with_innovations(solution, track)
+        for number, w in track.w.items():
+            graph.blocks[number].w = w
+        notes += linear_in(track.stages)
+        if track.unsettled is not None:
+            notes.append(f"predictions still moved by {track.unsettled:.2g} of their standard deviations after {PASSES} passes")
+        result = Result(Status.CONVERGED if track.unsettled is None else Status.MAX_ITERATIONS, [0.0])
+        return with_innovations(make_solution(problem, "eskf-passes", built, result, np.nan, spent, notes), track)

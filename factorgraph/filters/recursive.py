@@ -21,14 +21,15 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from factorgraph.assembly.conditioned import Conditioned, EpochIntegers, condition
-from factorgraph.assembly.flight import OFFSET_S, REBIAS, WholeFlight
+from factorgraph.assembly.flight import WholeFlight
 from factorgraph.assembly.optimizer import Graph, Result
 from factorgraph.assembly.result import make_solution
+from factorgraph.errors import InputError
 from factorgraph.filters import kalman, updates
 from factorgraph.filters.charts import BODY, Chart
 from factorgraph.filters.clouds import Cloud
 from factorgraph.filters.correctors import Corrector
-from factorgraph.filters.course import ChainEngine, Stage, Track, joint, smooth_values, with_innovations
+from factorgraph.filters.course import ChainEngine, Stage, Track, joint, linear_in, smooth_values, with_innovations
 from factorgraph.filters.sequential import StageRows, Stages
 from factorgraph.filters.sigma_points import Rule, root, rooted
 from factorgraph.filters.updates import Linearise, Updated
@@ -340,14 +341,19 @@ class Recursive:
         built, notes, spent = WholeFlight(self.name, ChainEngine).started(problem, progress)
         began = time.perf_counter()
         progress("filter", 0.3)
-        found = run(built.graph, self.method, problem.settings.robust, lambda f: progress("filter", 0.3 + 0.5 * f))
-        if self.smoothed:
-            progress("smoother", 0.8)
-            smooth_values(found.track)
+        try:
+            found = run(built.graph, self.method, problem.settings.robust, lambda f: progress("filter", 0.3 + 0.5 * f))
+            if self.smoothed:
+                progress("smoother", 0.8)
+                smooth_values(found.track)
+        except np.linalg.LinAlgError as error:
+            raise InputError(
+                f"{self.name} lost the covariance of this flight ({error}); a square-root filter may keep it"
+            ) from error
         spent[self.name] = time.perf_counter() - began
         settings = problem.settings.ambiguity
         wanted = settings.fix if self.integers is None else self.integers
-        notes += remarks(found)
+        notes += linear_in(found.s)
         result = Result(Status.DIVERGED if found.watch.trouble else Status.CONVERGED, [0.0])
         hand_out(built.graph, found, self.smoothed)
         if not wanted or not found.whole:
@@ -361,23 +367,6 @@ class Recursive:
             diagnostics = replace(solution.diagnostics, nis_t_s=d.nis_t_s, nis=d.nis, nis_dof=d.nis_dof)
             solution = replace(solution, residuals=of_floats.residuals, diagnostics=diagnostics)
         return finished(solution, found, self.smoothed)
-
-
-def remarks(found: Run) -> list[str]:
-    """What the filter could not use, and what it was linear in that has moved far."""
-    notes = [f"left out: {what}" for what in found.s.left_out] + found.track.notes
-    for v in found.s.vehicles:
-        if v.mode == "imu":
-            off = np.median(np.abs(v.bias - v.preintegrated_bias), axis=0)
-            if np.any(off > REBIAS):
-                notes.append(
-                    f"{v.name}: IMU increments belong to other biases (gyroscope {off[:3].max():.2g} rad/s, accelerometer"
-                    f" {off[3:].max():.2g} m/s^2 off) and were corrected to first order; the graph integrates them again"
-                )
-    moved = [p.name for p in found.s.parameters if p.unit == "s" and np.any(np.abs(p.value - p.prior) > OFFSET_S)]
-    if moved:
-        notes.append(f"time offsets applied by rates, not by attaching measurements to other states: {', '.join(moved)}")
-    return notes
 
 
 def hand_out(graph: Graph, found: Run, smoothed: bool) -> None:
@@ -406,4 +395,7 @@ class IteratedSmoother:
 
     def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
         """Solve a problem. Raises InputError for what cannot be estimated; anything less is in the diagnostics."""
-        return WholeFlight("ieks", ChainEngine).solve(problem, progress)
+        left_out: list[str] = []
+        solution = WholeFlight("ieks", lambda: ChainEngine(left_out=left_out)).solve(problem, progress)
+        notes = tuple(f"left out: {what}" for what in dict.fromkeys(left_out))
+        return replace(solution, diagnostics=replace(solution.diagnostics, notes=solution.diagnostics.notes + notes))

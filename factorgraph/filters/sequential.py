@@ -32,6 +32,7 @@ from factorgraph.assembly.parameters import Parameter
 from factorgraph.assembly.pieces import sliced
 from factorgraph.assembly.priors import MotionBlock, ParameterPrior, StatePrior
 from factorgraph.assembly.variables import VehicleVariables
+from factorgraph.errors import InputError
 from factorgraph.filters.charts import BODY, Chart
 from factorgraph.models.imu_interval import States, carry_along, evaluate
 from factorgraph.types import Array, BoolArray, IntArray
@@ -98,6 +99,11 @@ class Part:
         return np.ones(self.part.n) if clocks is None else 1 - clocks.leverage(self.part.u)
 
 
+def usable(block: Block) -> bool:
+    """Whether a chain of stages can see the block's rows: of one time, of neighbouring ones, or of constants."""
+    return isinstance(block, (EndsBlock, ImuBlock, MotionBlock, StatePrior, ParameterPrior, NodeBlock))
+
+
 class Stages:
     """Positions of all variables, lifetimes of scalars, rows and transitions of stages."""
 
@@ -133,7 +139,7 @@ class Stages:
     def _sorted(self, block: Block, number: int) -> _Sorted | None:
         if isinstance(block, (ImuBlock, MotionBlock, StatePrior, ParameterPrior, NodeBlock)):
             return None
-        if not isinstance(block, EndsBlock):
+        if not usable(block) or not isinstance(block, EndsBlock):
             self.left_out.append(f"{block.rows.source}: {len(block.rows.factor.start)} constraints between two times")
             return None
         entry = block.entries()
@@ -143,7 +149,7 @@ class Stages:
         if not np.all(alone):
             self.left_out.append(f"{block.rows.source}: {int(np.sum(~alone))} groups of rows that see two times")
         if np.any(np.diff(stage) < 0):
-            raise ValueError(f"{block.rows.source}: rows are not in the order of their states")
+            raise InputError(f"{block.rows.source}: rows are not in the order of their states")
         judged = block.rows.kind != CONSTRAINT
         if isinstance(block, GnssBlock) and block.reference is None:
             judged &= block.rows.kind != CODE

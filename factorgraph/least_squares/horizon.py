@@ -52,6 +52,7 @@ from factorgraph.solution import Solution, Status
 from factorgraph.types import Array, IntArray
 
 TIGHT = 1e-4  # of a bound's unit: how far a bound that holds may be left
+LOST, LASTING = 5.0, 10  # median residual in standard deviations, steps in a row, of a window that diverged
 WEAK = 1e4  # standard deviation of ambiguities and nodes when they are first seen, in their units
 
 
@@ -189,6 +190,7 @@ class Newest:
     values: list[tuple[Array, Array, Array, Array]]  # r, v, R, bias of each
     keys: list[int]  # of their variables and the parameters
     found: Conditioned  # joint covariance, and how the integers were fixed
+    misfit: float  # median of a source's normalised residuals in the window, absolute; the largest of all sources
     spent_s: float
 
 
@@ -283,12 +285,14 @@ class MovingHorizon:
             parts = [part_of(block, used) for block, used in zip(every, structure.used, strict=True)]
             found = structure.layout.factorise(parts)
             if isinstance(found, Undetermined):
+                if not np.isfinite(found.pivot):
+                    raise InputError(f"at {self.t_s[b]:.2f} s rows of the window are not finite")
                 raise InputError(f"at {self.t_s[b]:.2f} s nothing in the window determines {self.graph.name_of(found.key)}")
             factored = Factored(found)
             if leaving and iteration + 1 == self.settings.iterations:
                 arrival = self._arrival(structure, parts, leaving)
             self._move(factored, structure)
-        newest = self._newest(factored, constants, began)
+        newest = self._newest(factored, constants, _misfit(blocks), began)
         if arrival is not None:
             self.arrival, self.first = [arrival], a + leaving
             self.start = {key: value for key, value in self.start.items() if self.lives.last[key] >= self.first}
@@ -323,7 +327,7 @@ class MovingHorizon:
         for block in self.intervals if b > a else []:
             blocks.append(intervals_of(block, a, b))
         for key, first in self.lives.first.items():
-            if first == b or (b == 0 and first == 0):
+            if first == b:
                 self.start[key] = float(self.places[key].value()[0][0])
         blocks += [rows for block in self.processes if (rows := self._process(block)) is not None]
         weak = [key for key in self.start]
@@ -414,7 +418,7 @@ class MovingHorizon:
         parts += [np.eye(len(p.value)) for p in self.graph.parameters]
         return np.asarray(block_diag(*parts))
 
-    def _newest(self, factored: Factored, constants: list[int], began: float) -> Newest:
+    def _newest(self, factored: Factored, constants: list[int], misfit: float, began: float) -> Newest:
         """What is known of the newest state, conditioned on the ambiguities that can be fixed."""
         b = self.last
         keys = [key for v in self.vehicles for key in v.keys(b)] + constants
@@ -430,7 +434,20 @@ class MovingHorizon:
         for i, v in enumerate(self.vehicles if found.fixed else []):
             values[i] = self._inside(_moved(v, values[i], found.dx[at : at + sum(v.dims)]))
             at += sum(v.dims)
-        return Newest(values, keys, found, time.perf_counter() - began)
+        return Newest(values, keys, found, misfit, time.perf_counter() - began)
+
+
+def _misfit(blocks: Sequence[Block]) -> float:
+    t = [np.abs(b.normalised()[b.active & (b.rows.kind >= 0)]) for b in blocks]
+    return max((float(np.median(part)) for part in t if len(part)), default=0.0)
+
+
+def _lost(newest: Sequence[Newest]) -> IntArray:
+    """Steps with which LASTING begin whose residuals are far larger than declared, or not finite."""
+    far = np.array([not each.misfit < LOST for each in newest])
+    return (
+        np.flatnonzero(np.convolve(far, np.ones(LASTING), "valid") == LASTING) if len(far) >= LASTING else np.zeros(0, np.int64)
+    )
 
 
 def _row_of(place: Place) -> int:
@@ -531,5 +548,8 @@ class Horizon:
             f"steps of the window: median {1e3 * np.median(steps):.1f} ms, 99 % within {1e3 * np.quantile(steps, 0.99):.1f} ms"
         )
         integers = EpochIntegers.of([each.found for each in newest])
-        result = Result(Status.CONVERGED, [0.0])
+        lost_s = window.t_s[_lost(newest)]
+        if len(lost_s):
+            notes.append(f"the window left its measurements behind at {lost_s[0]:.2f} s")
+        result = Result(Status.DIVERGED if len(lost_s) else Status.CONVERGED, [0.0])
         return make_solution(problem, "moving-horizon", built, result, np.nan, spent, notes, integers)

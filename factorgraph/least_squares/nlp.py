@@ -119,7 +119,7 @@ class Box:
 
 
 @dataclass(slots=True)
-class Bounds:
+class Limits:
     """Limits of values: of components of variables, of heights, of ranges. Infinite where there is none on that side."""
 
     boxes: list[Box] = field(default_factory=list)
@@ -169,7 +169,7 @@ class Answer:
 def solve(
     graph: Graph,
     solver: Solver | None = None,
-    bounds: Bounds | None = None,
+    bounds: Limits | None = None,
     losses: Mapping[str, SmoothLoss] | None = None,
 ) -> Answer:
     """Minimise over all variables of an assembled graph from their current values, and move them there.
@@ -180,7 +180,7 @@ def solve(
     """
     solver = Solver() if solver is None else solver
     hessian = _checked(solver)
-    return _Program(graph, bounds or Bounds(), losses or {}, staged=solver.name == "fatrop").run(solver, hessian)
+    return _Program(graph, bounds or Limits(), losses or {}, staged=solver.name == "fatrop").run(solver, hessian)
 
 
 def _vehicle(graph: Graph, name: str) -> int:
@@ -485,7 +485,7 @@ def _tuple(found: Any) -> tuple[Any, ...]:
 class _Program:
     """Objective and constraints of a graph."""
 
-    def __init__(self, graph: Graph, bounds: Bounds, losses: Mapping[str, SmoothLoss], staged: bool) -> None:
+    def __init__(self, graph: Graph, bounds: Limits, losses: Mapping[str, SmoothLoss], staged: bool) -> None:
         graph.predict()
         self.graph, self.bounds, self.losses = graph, bounds, losses
         scales = {id(block): self._whitening(block) for block in graph.blocks}

@@ -21,6 +21,7 @@ from factorgraph.solution import Status
 from factorgraph.types import Array
 from tests.factorgraph.test_agreement import LINEAR_TO, linear_problem
 from tests.factorgraph.test_batch_simulation import IMU, PAIR, WITH_BASE, flight_of, pair_flight, relative, true_baseline
+from tests.factorgraph.test_horizon import with_barometer
 
 
 def quiet(stage: str, fraction: float) -> None:
@@ -79,7 +80,7 @@ def test_passes_are_the_filter_stage_by_stage(monkeypatch: pytest.MonkeyPatch, n
     monkeypatch.setattr(recursive, "WINDOW", 1)
     graphs = flight(name), flight(name)
     by_stage, track = recursive.run(graphs[0], recursive.Filter(), {}).track, passes.filtered(graphs[1])
-    assert not track.notes and bool(track.stages.processes) == bool(track.stages.parameters) == (name == "parameters")
+    assert track.unsettled is None and bool(track.stages.processes) == bool(track.stages.parameters) == (name == "parameters")
     assert off(by_stage, track) < states
     for x, y in zip(by_stage.course, track.course, strict=True):
         assert np.all(np.abs(x.dx - y.dx) < states * np.sqrt(np.diag(x.prior)))
@@ -156,7 +157,8 @@ def test_robust_weights_hold_gross_errors_off(kernel: str, width: float) -> None
 
 def test_passes_that_do_not_settle_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(passes, "PASSES", 1)
-    assert "after 1 passes" in passes.filtered(flight("motion")).notes[0]
+    unsettled = passes.filtered(flight("motion")).unsettled
+    assert unsettled is not None and unsettled > passes.SETTLED
 
 
 def test_the_method_ends_where_the_vehicles_are() -> None:
@@ -167,3 +169,9 @@ def test_the_method_ends_where_the_vehicles_are() -> None:
     assert np.all(np.abs(error[-1]) < 4 * np.sqrt(np.diagonal(pair.P[-1])[:3]))
     nis = solution.diagnostics
     assert 0.9 < nis.nis.sum() / nis.nis_dof.sum() < 1.1
+
+
+def test_a_barometers_nodes_have_their_places() -> None:
+    problem = with_barometer()
+    stagewise, whole = (solve(problem, method).vehicles[0] for method in ("eskf", "eskf-passes"))
+    np.testing.assert_allclose(whole.r_n, stagewise.r_n, rtol=0, atol=1e-4)

@@ -15,7 +15,7 @@ from factorgraph.least_squares.horizon import Bounds, Horizon, HorizonSettings, 
 from factorgraph.measurements import Calibration, HeightStream
 from factorgraph.problem import NavigationProblem, Vehicle
 from factorgraph.registry import solve
-from factorgraph.solution import Fix, Solution
+from factorgraph.solution import Fix, Solution, Status
 from tests.factorgraph.synthetic import FRAME
 from tests.factorgraph.test_agreement import linear_problem
 from tests.factorgraph.test_batch_simulation import pair_flight, relative, true_baseline
@@ -43,17 +43,20 @@ def test_on_linear_problems_the_newest_state_knows_the_whole_past(window_s: floa
         assert np.abs(y.r_n[5] - x.r_n[5]).max() > 0.01  # the past did not know the future
 
 
-def test_a_bias_that_walks_keeps_what_it_knew_when_nodes_leave() -> None:
-    """Heights with a barometer's bias: nodes enter and leave with the window."""
+def with_barometer() -> NavigationProblem:
+    """Heights of one vehicle with a bias that walks."""
     problem = linear_problem(4)
     t = np.arange(0.0, 39.5, 0.5)
     rng = np.random.default_rng(4)
     up = np.interp(t, problem.vehicles[0].positions[0].t_s, problem.vehicles[0].positions[0].r_n[:, 2])
-    heights = HeightStream(
-        t, up + 3.0 + rng.normal(0, 0.3, len(t)), np.full(len(t), 0.3), calibration=Calibration(bias=5.0, bias_walk=0.3)
-    )
-    vehicles = (replace(problem.vehicles[0], heights=(heights,)), problem.vehicles[1])
-    problem = replace(problem, vehicles=vehicles)
+    z, calibration = up + 3.0 + rng.normal(0, 0.3, len(t)), Calibration(bias=5.0, bias_walk=0.3)
+    heights = HeightStream(t, z, np.full(len(t), 0.3), calibration=calibration)
+    return replace(problem, vehicles=(replace(problem.vehicles[0], heights=(heights,)), problem.vehicles[1]))
+
+
+def test_a_bias_that_walks_keeps_what_it_knew_when_nodes_leave() -> None:
+    """Nodes enter and leave with the window."""
+    problem = with_barometer()
     batch, windowed = solve(problem), run(problem, HorizonSettings(8.0))
     np.testing.assert_allclose(windowed.vehicles[0].r_n[-1], batch.vehicles[0].r_n[-1], rtol=0, atol=1e-5)
     np.testing.assert_allclose(windowed.vehicles[0].P[-1, :6, :6], batch.vehicles[0].P[-1, :6, :6], rtol=1e-4, atol=1e-6)
@@ -116,6 +119,18 @@ def test_what_nothing_determines_is_named() -> None:
     window.arrival.clear()  # without the weak prior of the first state
     with pytest.raises(InputError, match=r"of a at 0\.00 s"):
         window.step()
+
+
+def test_a_window_that_leaves_its_measurements_says_so() -> None:
+    """Fixes that jump by a kilometre: no motion follows them."""
+    problem = linear_problem(7)
+    a, b = problem.vehicles
+    wild = a.positions[0].r_n + np.random.default_rng(7).normal(0.0, 1000.0, a.positions[0].r_n.shape)
+    problem = replace(problem, vehicles=(replace(a, positions=(replace(a.positions[0], r_n=wild),)), b))
+    solution = run(problem)
+    assert solution.diagnostics.status is Status.DIVERGED
+    assert any("sigma" in warning and "a/" in warning for warning in solution.diagnostics.warnings)
+    assert any("left its measurements" in note for note in solution.diagnostics.notes)
 
 
 def test_the_end_of_the_flight_is_told() -> None:

@@ -7,8 +7,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from factorgraph.assembly import integers, optimizer
+from factorgraph.assembly import integers
 from factorgraph.assembly.integers import groups_in_time
+from factorgraph.graphs import engine
 from factorgraph.registry import solve
 from factorgraph.solution import Solution
 from scenarios.simulate import load_scenario, simulate
@@ -46,7 +47,7 @@ def slipping(seed: int) -> Solution:
 def test_small_groups_and_nested_orders_find_the_same_integers(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = slipping(1)
     monkeypatch.setattr(integers, "GROUP", 6)
-    monkeypatch.setattr(optimizer, "MANY_AMBIGUITIES", 5)
+    monkeypatch.setattr(engine, "MANY_AMBIGUITIES", 5)
     parts = slipping(1)
     assert len(whole.ambiguities.state) > 20 and whole.ambiguities.state.count("fixed") > 15
     np.testing.assert_array_equal(parts.ambiguities.integer, whole.ambiguities.integer)

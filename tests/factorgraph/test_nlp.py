@@ -21,7 +21,7 @@ from factorgraph.errors import InputError
 from factorgraph.grid import common_grid
 from factorgraph.least_squares import nlp
 from factorgraph.least_squares.engine import StageEngine
-from factorgraph.least_squares.nlp import Bounds, SmoothLoss, Solver, solve
+from factorgraph.least_squares.nlp import Limits, SmoothLoss, Solver, solve
 from factorgraph.models.receivers import receivers
 from factorgraph.problem import Robust
 from scenarios.simulate import simulate
@@ -116,7 +116,7 @@ def test_a_bound_is_held_and_costs_what_fixing_there_costs(solver: str) -> None:
     answers, states = [], []
     for low in (-np.inf, bound):
         graph = graph_of(WITH_BASE)
-        limits = Bounds()
+        limits = Limits()
         limits.bias(graph, "a", "accelerometer", 2, low, bound)
         answers.append(solve(graph, Solver(solver), limits))
         states.append(graph.values().trajectories)
@@ -135,7 +135,7 @@ def test_ranges_stay_above_a_limit() -> None:
     graph.take(optimum(PAIR))
     block = next(b for b in graph.blocks if isinstance(b, RangeBlock))
     least = float((block.z_m - block.y).min()) + 0.02
-    limits = Bounds()
+    limits = Limits()
     limits.range(block, least)
     limits.height(graph, "a", 0.0, 1000.0)  # far away
     assert solve(graph, Solver("ipopt"), limits).success
@@ -148,7 +148,7 @@ def test_heights_stay_below_a_ceiling(solver: str) -> None:
     graph = graph_of(WITH_BASE)
     up = optimum(WITH_BASE).trajectories[1].r[:, 2]
     ceiling = float(up.max()) - 0.01
-    limits = Bounds()
+    limits = Limits()
     limits.height(graph, "a", -np.inf, ceiling)
     assert solve(graph, Solver(solver), limits).success
     below = ceiling - graph.vehicles[1].r[:, 2]
@@ -159,7 +159,7 @@ def test_what_is_impossible_names_the_measurement(capfd: pytest.CaptureFixture[s
     """A vehicle that is to be at two heights."""
     graph = graph_of(WITH_BASE)
     before = graph.values()
-    limits = Bounds()
+    limits = Limits()
     limits.height(graph, "a", 100.0, 101.0)
     limits.height(graph, "a", 300.0, 301.0)
     answer = solve(graph, Solver("ipopt", max_iterations=25), limits)
@@ -198,7 +198,7 @@ def test_what_cannot_be_used_is_said() -> None:
             solve(graph, solver)
     with pytest.raises(InputError, match="not smooth"):
         SmoothLoss("tukey", 2.0)
-    limits = Bounds()
+    limits = Limits()
     with pytest.raises(InputError, match="no vehicle 'c'"):
         limits.height(graph, "c", 0.0, 1.0)
     with pytest.raises(InputError, match="no parameter"):
@@ -226,7 +226,7 @@ ROWS: list[tuple[Any, ...]] = [
 
 def rows_follow(graph: Graph, block: Block, *_: Any) -> None:
     """Rows at a step are those of the block after the step, common clocks aside."""
-    program = nlp._Program(replace(graph, blocks=[block]), Bounds(), {}, staged=False)
+    program = nlp._Program(replace(graph, blocks=[block]), Limits(), {}, staged=False)
     scale = np.array(
         [1e-3 if chr(key >> 56) in "xbl" else 0.1 for key in program.unknowns.dim for _ in range(program.unknowns.dim[key])]
     )
