@@ -20,3 +20,11 @@ def test_graph_and_least_squares_agree(name: str) -> None:
     assert graph.diagnostics.status is other.diagnostics.status is Status.CONVERGED
     r, turn, sigma = differences(graph, other)
     assert r < POSITION_M and turn < ATTITUDE_RAD and sigma < COVARIANCE
+
+
+def test_a_smoother_iterated_finds_the_same_integers_and_optimum() -> None:
+    """Arcs that end and begin: their ambiguities share no epoch, and the filter's chain still knows their covariance."""
+    problem = load("cssrlib_kin_2021_265", shared_data("README.md").parent).problem
+    graph, other = solve(problem), solve(problem, "ieks")
+    r, _, sigma = differences(graph, other)
+    assert r < POSITION_M and sigma < COVARIANCE

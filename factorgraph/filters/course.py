@@ -17,6 +17,7 @@ import numpy as np
 from factorgraph.assembly.blocks import Block
 from factorgraph.assembly.engine import Linear
 from factorgraph.assembly.flight import OFFSET_S, REBIAS
+from factorgraph.assembly.keys import dimension
 from factorgraph.assembly.optimizer import Graph
 from factorgraph.filters import kalman, smoother
 from factorgraph.filters.sequential import Stages, usable
@@ -36,6 +37,7 @@ class Stage:
     Q: Array  # (n, n)
     nis: float
     dof: float
+    A: Array | None = None  # (n, n of the stage ahead) gain of the smoother, once there is one
 
 
 @dataclass(slots=True)
@@ -72,7 +74,8 @@ def smooth(stages: Stages, course: list[Stage]) -> list[Array]:
     ahead, found = course[-1].dx, [np.zeros(len(course[-1].dx))]
     for k in range(stages.K - 2, -1, -1):
         here, there = course[k], course[k + 1]
-        ds, here.P = smoother.linear(here.P, there.F, there.Q, there.prior, ahead, there.P)
+        here.A = smoother.gain(here.P, there.F, there.prior)
+        ds, here.P = here.A @ ahead, smoother.with_gain(here.A, here.P, there.F, there.Q, there.P)
         found.append(ds)
         ahead = here.dx + ds
     return found[::-1]
@@ -127,8 +130,27 @@ class Solved:
         return np.array([self.deviations[k][s.columns(k, [key])] for key in map(int, keys) for k in (s.stage_of([key]),)])
 
     def covariance(self, keys: Sequence[int]) -> Array:
-        """Joint covariance (d, d) of variables of one stage."""
-        return self.covariances().joint(keys)
+        """Joint covariance (d, d) of any few variables, each at the last stage at which it is there.
+
+        Along the smoother's gains: cov(x_i, x_j) = A_i A_(i+1) ... A_(j-1) P_j.
+        """
+        s, course = self.track.stages, self.track.course
+        stage = np.array([s.stage_of([key]) for key in keys])
+        edges = np.cumsum([0, *(dimension(key) for key in keys)])
+        out, met = np.zeros((edges[-1], edges[-1])), np.zeros(0, np.int64)
+        W = np.zeros((0, 0))
+        for k in range(int(stage.min()), int(stage.max()) + 1):
+            own = course[k]
+            A = course[k - 1].A
+            W = W @ A if len(W) and A is not None else np.zeros((0, len(own.P)))
+            for i in np.flatnonzero(stage == k).tolist():
+                M = np.eye(len(own.P))[s.columns(k, [keys[i]])]
+                M[:, : s.n_states] = M[:, : s.n_states] @ own.T
+                mine = np.arange(edges[i], edges[i + 1])
+                W, met = np.vstack([W, M]), np.concatenate([met, mine])
+                out[np.ix_(met, mine)] = W @ own.P @ M.T
+                out[np.ix_(mine, met)] = out[np.ix_(met, mine)].T
+        return out
 
     def covariances(self) -> StageCovariances:
         """Those of variables that share a stage."""

@@ -36,11 +36,20 @@ def linear(P: Array, F: Array, Q: Array, P_prior: Array, ahead: Array, P_ahead: 
     P (n, n) filtered; F (k, n), Q (k, k) to the next time; P_prior (k, k) predicted there; ahead (k,), P_ahead (k, k): smoothed
     less predicted state and smoothed covariance there. Raises LinAlgError where P_prior is singular.
     """
-    FP = F @ P
-    A = _gain(FP.T, P_prior)
+    A = gain(P, F, P_prior)
+    return A @ ahead, with_gain(A, P, F, Q, P_ahead)
+
+
+def gain(P: Array, F: Array, P_prior: Array) -> Array:
+    """A (n, k) of the smoother; of smoothed states, cov(x_i, x_(i+1)) = A cov(x_(i+1)), and so on. Raises as `linear`."""
+    return _gain((F @ P).T, P_prior)
+
+
+def with_gain(A: Array, P: Array, F: Array, Q: Array, P_ahead: Array) -> Array:
+    """Smoothed covariance (n, n)."""
     B = np.eye(len(P)) - A @ F
     out = B @ P @ B.T + A @ (P_ahead + Q) @ A.T
-    return A @ ahead, 0.5 * (out + out.T)
+    return np.asarray(0.5 * (out + out.T))
 
 
 def crossed(P: Array, cross: Array, P_prior: Array, ahead: Array, P_ahead: Array) -> tuple[Array, Array]:
