@@ -255,3 +255,14 @@ def linear_in(s: Stages) -> list[str]:
     if moved:
         notes.append(f"time offsets applied by rates, not by attaching measurements to other states: {', '.join(moved)}")
     return notes
+
+
+def hand_out(graph: Graph, track: Track, smoothed: bool = False) -> None:
+    """A track as the solved problem that a solution is made from."""
+    graph.assemble()
+    graph.engine = ChainEngine(track)
+    graph.predict()
+    for number, y in track.y.items() if not smoothed else ():
+        graph.blocks[number].y = y
+    for number, w in track.w.items():
+        graph.blocks[number].w = w

@@ -35,7 +35,7 @@ from factorgraph.assembly.flight import WholeFlight
 from factorgraph.assembly.optimizer import Graph, Result
 from factorgraph.assembly.result import make_solution
 from factorgraph.filters._scan import Found, Layout, Motion, Points, scan
-from factorgraph.filters.course import ChainEngine, Stage, Track, linear_in, with_innovations
+from factorgraph.filters.course import ChainEngine, Stage, Track, hand_out, linear_in, with_innovations
 from factorgraph.filters.sequential import Stages
 from factorgraph.models.robust import Loss
 from factorgraph.models.robust import weight as robust_weight
@@ -390,14 +390,7 @@ class InPasses:
         began = time.perf_counter()
         track = filtered(built.graph, lambda f: progress("filter", 0.3 + 0.6 * f), problem.settings.robust)
         spent["eskf-passes"] = time.perf_counter() - began
-        graph = built.graph
-        graph.assemble()
-        graph.engine = ChainEngine(track)
-        graph.predict()
-        for number, y in track.y.items():
-            graph.blocks[number].y = y
-        for number, w in track.w.items():
-            graph.blocks[number].w = w
+        hand_out(built.graph, track)
         notes += linear_in(track.stages)
         if track.unsettled is not None:
             notes.append(f"predictions still moved by {track.unsettled:.2g} of their standard deviations after {PASSES} passes")

@@ -29,7 +29,7 @@ from factorgraph.filters import kalman, updates
 from factorgraph.filters.charts import BODY, Chart
 from factorgraph.filters.clouds import Cloud
 from factorgraph.filters.correctors import Corrector
-from factorgraph.filters.course import ChainEngine, Stage, Track, joint, linear_in, smooth_values, with_innovations
+from factorgraph.filters.course import ChainEngine, Stage, Track, hand_out, joint, linear_in, smooth_values, with_innovations
 from factorgraph.filters.sequential import StageRows, Stages
 from factorgraph.filters.sigma_points import Rule, root, rooted
 from factorgraph.filters.updates import Linearise, Updated
@@ -355,7 +355,7 @@ class Recursive:
         wanted = settings.fix if self.integers is None else self.integers
         notes += linear_in(found.s)
         result = Result(Status.DIVERGED if found.watch.trouble else Status.CONVERGED, [0.0])
-        hand_out(built.graph, found, self.smoothed)
+        hand_out(built.graph, found.track, self.smoothed)
         if not wanted or not found.whole:
             solution = make_solution(problem, self.name, built, result, np.nan, spent, notes)
             return finished(solution, found, self.smoothed)
@@ -367,17 +367,6 @@ class Recursive:
             diagnostics = replace(solution.diagnostics, nis_t_s=d.nis_t_s, nis=d.nis, nis_dof=d.nis_dof)
             solution = replace(solution, residuals=of_floats.residuals, diagnostics=diagnostics)
         return finished(solution, found, self.smoothed)
-
-
-def hand_out(graph: Graph, found: Run, smoothed: bool) -> None:
-    """A run as the solved problem that a solution is made from."""
-    graph.assemble()
-    graph.engine = ChainEngine(found.track)
-    graph.predict()
-    for number, y in found.track.y.items() if not smoothed else ():
-        graph.blocks[number].y = y
-    for number, w in found.track.w.items():
-        graph.blocks[number].w = w
 
 
 def finished(solution: Solution, found: Run, smoothed: bool) -> Solution:

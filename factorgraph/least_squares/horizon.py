@@ -330,7 +330,7 @@ class MovingHorizon:
             if first == b:
                 self.start[key] = float(self.places[key].value()[0][0])
         blocks += [rows for block in self.processes if (rows := self._process(block)) is not None]
-        weak = [key for key in self.start]
+        weak = list(self.start)
         if weak:
             n = len(weak)
             table = plain_rows(-1, np.zeros(n), np.full(n, WEAK), np.arange(n), "scalars", ["start"], np.zeros(n, np.int64))
