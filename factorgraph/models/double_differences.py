@@ -64,8 +64,11 @@ class PairEpochs:
         return np.concatenate([[pivot], seen[seen != pivot]])
 
 
-def pair_epochs(reference: Receiver, rover: Receiver, settings: Settings) -> PairEpochs:
-    """Shared observations of two receivers. Raises InputError where nothing is shared, or several signals are."""
+def pair_epochs(reference: Receiver, rover: Receiver, settings: Settings, needs_phase: bool = True) -> PairEpochs:
+    """Shared observations of two receivers; without `needs_phase`, code and rate make a satellite usable.
+
+    Raises InputError where nothing is shared, or several signals are.
+    """
     a, b = reference.antenna.stream, rover.antenna.stream
     pairs = pair_rows(a, b, reference.usable, rover.usable, settings.bands)
     names = f"{reference.vehicle.name}-{rover.vehicle.name}"
@@ -77,10 +80,10 @@ def pair_epochs(reference: Receiver, rover: Receiver, settings: Settings) -> Pai
     lam = b.wavelength_m[pairs.b]
     if np.ptp(lam) > 1e-9:
         raise InputError(f"link {names}: this filter takes satellites of one carrier, not GLONASS; choose with systems")
-    return _tabled(reference, rover, pairs, settings)
+    return _tabled(reference, rover, pairs, settings, needs_phase)
 
 
-def _tabled(reference: Receiver, rover: Receiver, pairs: PairedRows, settings: Settings) -> PairEpochs:
+def _tabled(reference: Receiver, rover: Receiver, pairs: PairedRows, settings: Settings, needs_phase: bool) -> PairEpochs:
     a, b = reference.antenna.stream, rover.antenna.stream
     ra, rb = pairs.a, pairs.b
     pa, pb = reference.differenced, rover.differenced
@@ -100,7 +103,9 @@ def _tabled(reference: Receiver, rover: Receiver, pairs: PairedRows, settings: S
     elevation = table(pb.elevation_rad[rb])
     first = np.searchsorted(k, np.arange(len(epochs)))
     vel_a, vel_b = table(pa.sat_vel_n[ra]), table(pb.sat_vel_n[rb])
-    moving = np.isfinite(vel_a).all(axis=2) & np.isfinite(vel_b).all(axis=2)
+    usable = np.isfinite(code) & np.isfinite(rate) & np.isfinite(vel_a).all(axis=2) & np.isfinite(vel_b).all(axis=2)
+    if needs_phase:
+        usable &= np.isfinite(phase) & (arc >= 0)
     return PairEpochs(
         t_reference_s=pa.t_s[ra[first]],
         t_rover_s=pb.t_s[rb[first]],
@@ -116,7 +121,7 @@ def _tabled(reference: Receiver, rover: Receiver, pairs: PairedRows, settings: S
         elevation_rad=elevation,
         variance_scale=2.0 * elevation_scale(elevation) ** 2,
         arc=arc,
-        usable=np.isfinite(code) & np.isfinite(phase) & np.isfinite(rate) & (arc >= 0) & moving,
+        usable=usable,
     )
 
 

@@ -1,0 +1,318 @@
+"""What is measured of a formation: rows of double differences, absolute differences, ranges and heights, epoch by epoch.
+
+    DD P        = -(e_s - e_1) r                          + noise       e: line of sight from between both vehicles
+    -lam DD D   = -(e_s - e_1) v - (de_s - de_1)/dt r     + noise       1: the highest satellite
+    r_abs, v_abs = r, v                                   + noise       differences of the vehicles' own filters
+    range       = scale |r_b + a_b - r_a - a_a|           + noise       a: arms from a body's origin to its tag
+
+in Earth-fixed axes. Double differences are not linearised: what is measured is set against exact ranges at the prediction, and
+the row carries the difference, z = measured - predicted(r) + H r. Followers share the reference's noise, and all differences to
+one pivot share the pivot's; both are in R. Differences of the vehicles' own filters were computed from the same code: their
+covariance is multiplied (`AbsoluteDifferences.factor`) because they are not independent of the double differences.
+
+Source: Lu et al. (2024), eqs. 32 to 35; spec ahrs_tdo.md, section 2.4, errata E17 to E19 and E28; spec common.md, section 5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from factorgraph.errors import not_negative, positive
+from factorgraph.filters.relative.motion import EARTH_RATE, position, velocity
+from factorgraph.geodesy import LocalFrame
+from factorgraph.models import double_differences as dd
+from factorgraph.models.double_differences import PairEpochs
+from factorgraph.models.gnss import elevation_scale
+from factorgraph.problem import GnssNoise
+from factorgraph.types import Array, BoolArray, IntArray
+
+KINDS = ("code", "doppler", "position", "velocity", "range", "height")
+CODE, DOPPLER, POSITION, VELOCITY, RANGE, HEIGHT = range(len(KINDS))
+MATCH_S = 2e-3  # measurements this near to each other belong to one epoch
+FEWEST = 2  # satellites of a difference
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Measurements of one epoch; n states, m rows. Rows of distances are h = scale |D x + d|, the others h = H x."""
+
+    z: Array  # (m,)
+    H: Array  # (m, n); of distances not used
+    R: Array  # (m, m)
+    kind: IntArray  # (m,) of KINDS
+    norm_rows: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (q,)
+    norm_D: Array = field(default_factory=lambda: np.zeros((0, 3, 0)))  # (q, 3, n)
+    norm_d: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (q, 3)
+    norm_scale: Array = field(default_factory=lambda: np.zeros(0))  # (q,)
+
+    def linearised(self, x: Array) -> tuple[Array, Array]:
+        """Innovations (m,) and rows (m, n) at x (n,); a distance of zero has no direction and says nothing."""
+        nu, H = self.z - self.H @ x, self.H
+        if len(self.norm_rows):
+            way = self.norm_D @ x + self.norm_d
+            size = np.linalg.norm(way, axis=1)
+            unit = way / np.where(size > 0, size, np.inf)[:, None]
+            H = H.copy()
+            H[self.norm_rows] = self.norm_scale[:, None] * np.einsum("qa,qan->qn", unit, self.norm_D)
+            nu[self.norm_rows] = self.z[self.norm_rows] - self.norm_scale * size
+        return nu, H
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Where the vehicles' points are, apart from the states: K epochs, N vehicles, ECEF axes."""
+
+    reference_e: Array  # (K, 3) of the reference's body
+    reference_v_e: Array  # (K, 3)
+    arm_e: Array  # (N, K, 3) from each body to its antenna
+    arm_v_e: Array  # (N, K, 3) how fast it turns
+
+
+class Source(Protocol):
+    """Measurements of one kind."""
+
+    def rows(self, k: int, x: Array) -> Rows | None:
+        """Those of epoch k, set against the predicted states x (n,); None without any."""
+        ...
+
+
+def stacked(parts: Sequence[Rows]) -> Rows:
+    """Independent sets of rows as one, in their order."""
+    sizes = np.cumsum([0, *(len(part.z) for part in parts)])
+    R = np.zeros((sizes[-1], sizes[-1]))
+    for part, a, b in zip(parts, sizes, sizes[1:], strict=False):
+        R[a:b, a:b] = part.R
+    return Rows(
+        np.concatenate([part.z for part in parts]),
+        np.concatenate([part.H for part in parts]),
+        R,
+        np.concatenate([part.kind for part in parts]),
+        np.concatenate([part.norm_rows + a for part, a in zip(parts, sizes, strict=False)]),
+        np.concatenate([part.norm_D if len(part.norm_rows) else np.zeros((0, 3, parts[0].H.shape[1])) for part in parts]),
+        np.concatenate([part.norm_d for part in parts]),
+        np.concatenate([part.norm_scale for part in parts]),
+    )
+
+
+def nearest_epoch(t_s: Array, epochs_s: Array) -> IntArray:
+    """Of each epoch (K,) the index into t_s (n,) of what belongs to it, -1 without."""
+    if not len(t_s):
+        return np.full(len(epochs_s), -1)
+    after = np.clip(np.searchsorted(t_s, epochs_s), 1, max(len(t_s) - 1, 1))
+    near = np.where(epochs_s - t_s[after - 1] <= t_s[np.minimum(after, len(t_s) - 1)] - epochs_s, after - 1, after)
+    near = np.minimum(near, len(t_s) - 1)
+    return np.where(np.abs(t_s[near] - epochs_s) <= MATCH_S, near, -1)
+
+
+@dataclass(frozen=True, slots=True)
+class PairNoise:
+    """Undifferenced noise of a link's two receivers."""
+
+    reference: GnssNoise
+    rover: GnssNoise
+
+
+class CodeAndRate:
+    """Double-differenced code and range rate of every follower against the reference.
+
+    data: single differences follower less reference of each link, with the index of its follower (from 0).
+    """
+
+    def __init__(
+        self, data: dict[int, PairEpochs], noise: dict[int, PairNoise], places: Places, frame: LocalFrame, epochs_s: Array, n: int
+    ) -> None:
+        self.data, self.noise, self.places, self.frame, self.n = data, noise, places, frame, n
+        self.epochs_s = epochs_s
+        self.epoch = {i: nearest_epoch(pair.t_rover_s, epochs_s) for i, pair in data.items()}
+
+    def rows(self, k: int, x: Array) -> Rows | None:
+        seen = [(i, int(self.epoch[i][k])) for i in self.data if self.epoch[i][k] >= 0]
+        found = [(i, j, self.data[i].order(j)) for i, j in seen]
+        found = [one for one in found if len(one[2]) >= FEWEST]
+        if not found:
+            return None
+        parts = [self._of_link(i, j, k, order, x) for i, j, order in found]
+        m = [len(part[0]) for part in parts]
+        z = np.concatenate([np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])])
+        H = np.concatenate([np.concatenate([part[2] for part in parts]), np.concatenate([part[3] for part in parts])])
+        kind = np.repeat([CODE, DOPPLER], sum(m))
+        R = np.zeros((2 * sum(m), 2 * sum(m)))
+        for block, name in enumerate(("code_m", "doppler_mps")):
+            rows = slice(block * sum(m), (block + 1) * sum(m))
+            R[rows, rows] = self._noise(found, name)
+        return Rows(z, H, R, kind)
+
+    def _of_link(self, i: int, j: int, k: int, order: IntArray, x: Array) -> tuple[Array, Array, Array, Array]:
+        """Code and rate (m,) as linear rows (m, n), of follower i at epoch j of its link and k of ours."""
+        pair, places = self.data[i], self.places
+        to_n = self.frame.rotate_from_ecef
+        v, r = velocity(i), position(i)
+        late = np.array([pair.t_reference_s[j], pair.t_rover_s[j]]) - self.epochs_s[k]
+        va = places.reference_v_e[k] + places.arm_v_e[0, k]
+        vb = places.reference_v_e[k] + x[v] + places.arm_v_e[i + 1, k]
+        ra = places.reference_e[k] + places.arm_e[0, k] + late[0] * va
+        rb = places.reference_e[k] + x[r] + places.arm_e[i + 1, k] + late[1] * vb
+        rho, rate, G_n = dd.predict(
+            pair.sat_reference[j], pair.sat_rover[j], pair.vel_reference[j], pair.vel_rover[j], order,
+            self.frame.from_ecef(ra), to_n(va), self.frame.from_ecef(rb), to_n(vb),
+        )  # fmt: skip
+        G = self.frame.rotate_to_ecef(G_n)
+        G_rate = self.frame.rotate_to_ecef(
+            _sight_rates(pair, j, order, self.frame.from_ecef(0.5 * (ra + rb)), to_n(0.5 * (va + vb)))
+        )
+        H_code, H_rate = np.zeros((2, len(rho), self.n))
+        H_code[:, r], H_rate[:, v], H_rate[:, r] = G, G, G_rate
+        code = dd.difference(pair.code_m[j], order) - rho + G @ x[r]
+        doppler = dd.difference(pair.rate_mps[j], order) - rate + G @ x[v] + G_rate @ x[r]
+        return code, doppler, H_code, H_rate
+
+    def _noise(self, found: list[tuple[int, int, IntArray]], name: str) -> Array:
+        """R of one quantity, links after each other: D diag(sigma^2) D' with the reference's satellites in common."""
+        undifferenced: dict[tuple[int, str], int] = {}
+        variance: list[float] = []
+        entries: list[tuple[int, int, float]] = []
+        row = 0
+        for i, j, order in found:
+            pair, noise = self.data[i], self.noise[i]
+            for s in order:
+                for vehicle, told in ((-1, noise.reference), (i, noise.rover)):
+                    key = (vehicle, pair.satellites[s])
+                    if key not in undifferenced:
+                        undifferenced[key] = len(variance)
+                        scale = elevation_scale(pair.elevation_rad[j, s : s + 1], told.elevation)[0]
+                        variance.append((getattr(told, name) * float(scale)) ** 2)
+            for s in order[1:]:
+                for satellite, sign in ((s, 1.0), (order[0], -1.0)):
+                    entries.append((row, undifferenced[i, pair.satellites[satellite]], sign))
+                    entries.append((row, undifferenced[-1, pair.satellites[satellite]], -sign))
+                row += 1
+        D = np.zeros((row, len(variance)))
+        for at, column, sign in entries:
+            D[at, column] += sign
+        return np.asarray((D * variance) @ D.T)
+
+
+def _sight_rates(pair: PairEpochs, j: int, order: IntArray, middle_n: Array, v_n: Array) -> Array:
+    """-(de_s - de_1)/dt (m, 3) in n: how fast the lines of sight turn, de/dt = (I - e e')(v_s - v) / rho."""
+    sat = 0.5 * (pair.sat_reference[j, order] + pair.sat_rover[j, order])
+    speed = 0.5 * (pair.vel_reference[j, order] + pair.vel_rover[j, order]) - v_n
+    way = sat - middle_n
+    rho = np.linalg.norm(way, axis=1, keepdims=True)
+    e = way / rho
+    turn = (speed - e * np.sum(e * speed, axis=1, keepdims=True)) / rho
+    return np.asarray(turn[0] - turn[1:])
+
+
+class AbsoluteDifferences:
+    """Positions and velocities of the vehicles' own filters, follower less reference.
+
+    r_e, v_e (N, K, 3) ECEF and P (N, K, 6, 6) of position and velocity; NaN where a vehicle has none. `factor` multiplies the
+    covariance, see above.
+    """
+
+    def __init__(self, r_e: Array, v_e: Array, P: Array, n: int, factor: float = 4.0) -> None:
+        self.r_e, self.v_e, self.P, self.n, self.factor = r_e, v_e, P, n, factor
+        self.known: BoolArray = np.isfinite(np.concatenate([r_e, v_e, P.reshape(*r_e.shape[:2], 36)], axis=2)).all(axis=2)
+
+    def rows(self, k: int, x: Array) -> Rows | None:
+        followers = [i for i in range(len(self.r_e) - 1) if self.known[i + 1, k]]
+        if not self.known[0, k] or not followers:
+            return None
+        m = len(followers)
+        H, z, R = np.zeros((6 * m, self.n)), np.zeros(6 * m), np.zeros((6 * m, 6 * m))
+        for a, i in enumerate(followers):
+            rows = slice(6 * a, 6 * a + 6)
+            H[6 * a : 6 * a + 3, position(i)] = H[6 * a + 3 : 6 * a + 6, velocity(i)] = np.eye(3)
+            z[rows] = [*(self.r_e[i + 1, k] - self.r_e[0, k]), *(self.v_e[i + 1, k] - self.v_e[0, k])]
+            for b in range(m):
+                R[rows, 6 * b : 6 * b + 6] = self.P[0, k]
+            R[rows, rows] += self.P[i + 1, k]
+        return Rows(z, H, self.factor * R, np.tile(np.repeat([POSITION, VELOCITY], 3), m))
+
+
+@dataclass(frozen=True, slots=True)
+class RangeRow:
+    """One range: vehicles by number, the reference 0, and arms (3,) from each one's origin to its tag in Earth-fixed axes."""
+
+    a: int
+    b: int
+    arm_e: Array  # of b less that of a
+    range_m: float
+    sigma_m: float
+
+
+class Distances:
+    """Ranges between the vehicles, by epoch; `scale` is the crystal's factor where known, which the source does not estimate."""
+
+    def __init__(self, by_epoch: dict[int, list[RangeRow]], n: int, scale: float = 1.0) -> None:
+        self.by_epoch, self.n, self.scale = by_epoch, n, scale
+
+    def rows(self, k: int, x: Array) -> Rows | None:
+        found = self.by_epoch.get(k, [])
+        if not found:
+            return None
+        m = len(found)
+        D = np.zeros((m, 3, self.n))
+        for row, one in enumerate(found):
+            for vehicle, sign in ((one.b, 1.0), (one.a, -1.0)):
+                if vehicle > 0:
+                    D[row, :, position(vehicle - 1)] += sign * np.eye(3)
+        return Rows(
+            np.array([one.range_m for one in found]),
+            np.zeros((m, self.n)),
+            np.diag([one.sigma_m**2 for one in found]),
+            np.full(m, RANGE),
+            np.arange(m),
+            D,
+            np.array([one.arm_e for one in found]),
+            np.full(m, self.scale),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class HeightRow:
+    """The height of a follower over the reference [m]; up (3,) is the vertical in Earth-fixed axes."""
+
+    follower: int
+    up_e: Array
+    height_m: float
+    sigma_m: float
+
+
+class Heights:
+    """Heights of followers over a reference that stands still."""
+
+    def __init__(self, by_epoch: dict[int, list[HeightRow]], n: int) -> None:
+        self.by_epoch, self.n = by_epoch, n
+
+    def rows(self, k: int, x: Array) -> Rows | None:
+        found = self.by_epoch.get(k, [])
+        if not found:
+            return None
+        H = np.zeros((len(found), self.n))
+        for row, one in enumerate(found):
+            H[row, position(one.follower)] = one.up_e
+        z, sigma = np.array([(one.height_m, one.sigma_m) for one in found]).T
+        return Rows(z, H, np.diag(sigma**2), np.full(len(found), HEIGHT))
+
+
+def arms(C_eb: Array, w_b: Array, lever_b: Array) -> tuple[Array, Array]:
+    """Arm (K, 3) and its velocity (K, 3) in Earth-fixed axes of attitudes (K, 3, 3) and inertial rates (K, 3)."""
+    arm = C_eb @ lever_b
+    return arm, np.einsum("kij,kj->ki", C_eb, np.cross(w_b, lever_b)) - np.cross(EARTH_RATE, arm)
+
+
+@dataclass(frozen=True, slots=True)
+class RowSettings:
+    """Which measurements are used, and how they are told."""
+
+    absolute_factor: float = 4.0  # on the covariance of the differences of the vehicles' own filters; 0: they are left out
+    range_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        not_negative(self, "absolute_factor")
+        positive(self, "range_scale")
