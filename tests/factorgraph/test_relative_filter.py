@@ -23,7 +23,7 @@ from scenarios.simulate import load_scenario
 from scenarios.simulate.flight import Exact, exact
 from tests.helpers import numerical_jacobian
 
-MODEL = AccelModel(5e-4, 0.01, 3600.0, (2e-3, 2e-3, 5e-3), 5.0)
+MODEL = AccelModel(5e-4, 0.01, 3600.0, (6e-3, 6e-3, 16e-3))
 UAVS = ("leader", "follower")
 
 
@@ -105,7 +105,7 @@ def test_check_3_attitude_noise_moves_velocity_and_not_position(flown: tuple[Exa
     )
     Q = moving.predict(1, np.zeros(12))[2]
     f = follower.f_e[100]
-    S = follower.C_en.T @ silent.attitude_density @ follower.C_en
+    S = follower.C_en.T @ np.diag(np.square(silent.attitude_rad_rthz)) @ follower.C_en
     np.testing.assert_allclose(Q[:3, :3], dt * skew(f) @ S @ skew(f).T, rtol=1e-9, atol=1e-18)
     assert np.trace(Q[3:6, 3:6]) < dt**2 * np.trace(Q[:3, :3])
     assert not np.any(Q[6:, :])
@@ -155,8 +155,8 @@ def distances_and_places(rng: np.random.Generator, R: Array, n: int, walk: Array
     turned = np.kron(np.eye(2), R)
     P = turned @ P @ turned.T
     measured = np.linalg.norm(walk[:, 3:], axis=1) + 0.1 * rng.normal(size=K)
-    by_epoch = {k: [rows.RangeRow(0, 1, np.zeros(3), float(measured[k]), 0.1)] for k in range(K)}
-    return [rows.AbsoluteDifferences(r_e, v_e, P, n, factor=1.0), rows.Distances(by_epoch, n)]
+    by_epoch = {k: [rows.RangeRow(0, 1, np.zeros(3), float(measured[k]), 0.1, "a-b")] for k in range(K)}
+    return [rows.AbsoluteDifferences(r_e, v_e, P, ("a", "b"), n, factor=1.0), rows.Distances(by_epoch, n)]
 
 
 def walk_of(rng: np.random.Generator, t: Array, size: float) -> Array:
@@ -206,7 +206,7 @@ def test_errors_are_as_large_as_told() -> None:
 
 
 def test_rows_of_distances_are_the_derivative() -> None:
-    source = rows.Distances({0: [rows.RangeRow(1, 2, np.array([0.1, -0.2, 0.3]), 40.0, 0.1)]}, 15, scale=1.001)
+    source = rows.Distances({0: [rows.RangeRow(1, 2, np.array([0.1, -0.2, 0.3]), 40.0, 0.1, "b-c")]}, 15, scale=1.001)
     x = np.random.default_rng(3).normal(0.0, 20.0, 15)
     found = source.rows(0, x)
     assert found is not None
@@ -219,7 +219,7 @@ def test_rows_of_distances_are_the_derivative() -> None:
 
 
 def test_a_distance_of_zero_says_nothing() -> None:
-    source = rows.Distances({0: [rows.RangeRow(0, 1, np.zeros(3), 1.0, 0.1)]}, 6)
+    source = rows.Distances({0: [rows.RangeRow(0, 1, np.zeros(3), 1.0, 0.1, "a-b")]}, 6)
     found = source.rows(0, np.zeros(6))
     assert found is not None
     nu, H = found.linearised(np.zeros(6))
@@ -227,11 +227,12 @@ def test_a_distance_of_zero_says_nothing() -> None:
 
 
 def test_stacked_rows_keep_order_and_names() -> None:
-    a = rows.Rows(np.array([1.0, 2.0]), np.eye(2, 6), np.eye(2), np.array([rows.CODE, rows.DOPPLER]))
-    b = rows.Distances({0: [rows.RangeRow(0, 1, np.zeros(3), 3.0, 0.5)]}, 6).rows(0, np.ones(6))
+    a = rows.Rows(np.array([1.0, 2.0]), np.eye(2, 6), np.eye(2), np.array([rows.CODE, rows.DOPPLER]), ("b G02-G01", "b G02-G01"))
+    b = rows.Distances({0: [rows.RangeRow(0, 1, np.zeros(3), 3.0, 0.5, "a-b")]}, 6).rows(0, np.ones(6))
     assert b is not None
     both = rows.stacked([a, b])
     assert [rows.KINDS[k] for k in both.kind] == ["code", "doppler", "range"]
+    assert both.labels == ("b G02-G01", "b G02-G01", "a-b")
     assert both.z.tolist() == [1.0, 2.0, 3.0] and both.norm_rows.tolist() == [2] and both.R[2, 2] == 0.25
 
 

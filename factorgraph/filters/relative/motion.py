@@ -47,22 +47,16 @@ class AccelModel:
     white_mps2_rthz: float
     markov_mps2: float  # steady standard deviation of df
     markov_s: float
-    attitude_rad: tuple[float, float, float]  # standard deviations about east, north and up
-    attitude_s: float  # correlation time of the attitude errors
+    attitude_rad_rthz: tuple[float, float, float]  # errors as white noise about east, north, up: sigma sqrt(2 tau)
 
     def __post_init__(self) -> None:
-        positive(self, "markov_s", "attitude_s")
+        positive(self, "markov_s")
         not_negative(self, "white_mps2_rthz", "markov_mps2")
-        if not min(self.attitude_rad) >= 0:
-            raise InputError(f"AccelModel.attitude_rad must not be negative, got {self.attitude_rad}")
-
-    @property
-    def attitude_density(self) -> Array:
-        """Density (3, 3) [rad^2 s] of the attitude error as white noise, east-north-up."""
-        return np.diag(2.0 * np.square(self.attitude_rad) * self.attitude_s)
+        if not min(self.attitude_rad_rthz) >= 0:
+            raise InputError(f"AccelModel.attitude_rad_rthz must not be negative, got {self.attitude_rad_rthz}")
 
 
-PERFECT = AccelModel(0.0, 0.0, 1.0, (0.0, 0.0, 0.0), 1.0)  # of a reference that stands on the ground
+PERFECT = AccelModel(0.0, 0.0, 1.0, (0.0, 0.0, 0.0))  # of a reference that stands on the ground
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +142,7 @@ def integrate(mover: Mover, t_s: Array) -> Increments:
             f"the epochs {t_s[0]:.3f} to {t_s[-1]:.3f} s"
         )
     m = mover.model
-    S = mover.C_en.T @ m.attitude_density @ mover.C_en
+    S = mover.C_en.T @ np.diag(np.square(m.attitude_rad_rthz)) @ mover.C_en
     return Increments(*_integrate(mover.edges, mover.f_e, mover.C_eb, S, m.white_mps2_rthz, m.markov_s, m.markov_mps2, t_s))
 
 

@@ -21,7 +21,6 @@ from typing import Protocol
 
 import numpy as np
 
-from factorgraph.errors import not_negative, positive
 from factorgraph.filters.relative.motion import EARTH_RATE, position, velocity
 from factorgraph.geodesy import LocalFrame
 from factorgraph.models import double_differences as dd
@@ -44,6 +43,7 @@ class Rows:
     H: Array  # (m, n); of distances not used
     R: Array  # (m, m)
     kind: IntArray  # (m,) of KINDS
+    labels: tuple[str, ...]  # (m,) vehicles, and satellites less pivot or axis
     norm_rows: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (q,)
     norm_D: Array = field(default_factory=lambda: np.zeros((0, 3, 0)))  # (q, 3, n)
     norm_d: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (q, 3)
@@ -91,6 +91,7 @@ def stacked(parts: Sequence[Rows]) -> Rows:
         np.concatenate([part.H for part in parts]),
         R,
         np.concatenate([part.kind for part in parts]),
+        tuple(label for part in parts for label in part.labels),
         np.concatenate([part.norm_rows + a for part, a in zip(parts, sizes, strict=False)]),
         np.concatenate([part.norm_D if len(part.norm_rows) else np.zeros((0, 3, parts[0].H.shape[1])) for part in parts]),
         np.concatenate([part.norm_d for part in parts]),
@@ -123,10 +124,11 @@ class CodeAndRate:
     """
 
     def __init__(
-        self, data: dict[int, PairEpochs], noise: dict[int, PairNoise], places: Places, frame: LocalFrame, epochs_s: Array, n: int
-    ) -> None:
+        self, data: dict[int, PairEpochs], noise: dict[int, PairNoise], places: Places, frame: LocalFrame,
+        epochs_s: Array, names: tuple[str, ...], n: int,
+    ) -> None:  # fmt: skip
         self.data, self.noise, self.places, self.frame, self.n = data, noise, places, frame, n
-        self.epochs_s = epochs_s
+        self.epochs_s, self.names = epochs_s, names
         self.epoch = {i: nearest_epoch(pair.t_rover_s, epochs_s) for i, pair in data.items()}
 
     def rows(self, k: int, x: Array) -> Rows | None:
@@ -144,7 +146,11 @@ class CodeAndRate:
         for block, name in enumerate(("code_m", "doppler_mps")):
             rows = slice(block * sum(m), (block + 1) * sum(m))
             R[rows, rows] = self._noise(found, name)
-        return Rows(z, H, R, kind)
+        return Rows(z, H, R, kind, 2 * tuple(label for i, _, order in found for label in self._labels(i, order)))
+
+    def _labels(self, i: int, order: IntArray) -> list[str]:
+        satellites = self.data[i].satellites
+        return [f"{self.names[i + 1]} {satellites[s]}-{satellites[order[0]]}" for s in order[1:]]
 
     def _of_link(self, i: int, j: int, k: int, order: IntArray, x: Array) -> tuple[Array, Array, Array, Array]:
         """Code and rate (m,) as linear rows (m, n), of follower i at epoch j of its link and k of ours."""
@@ -214,8 +220,8 @@ class AbsoluteDifferences:
     covariance, see above.
     """
 
-    def __init__(self, r_e: Array, v_e: Array, P: Array, n: int, factor: float = 4.0) -> None:
-        self.r_e, self.v_e, self.P, self.n, self.factor = r_e, v_e, P, n, factor
+    def __init__(self, r_e: Array, v_e: Array, P: Array, names: tuple[str, ...], n: int, factor: float = 4.0) -> None:
+        self.r_e, self.v_e, self.P, self.names, self.n, self.factor = r_e, v_e, P, names, n, factor
         self.known: BoolArray = np.isfinite(np.concatenate([r_e, v_e, P.reshape(*r_e.shape[:2], 36)], axis=2)).all(axis=2)
 
     def rows(self, k: int, x: Array) -> Rows | None:
@@ -231,7 +237,8 @@ class AbsoluteDifferences:
             for b in range(m):
                 R[rows, 6 * b : 6 * b + 6] = self.P[0, k]
             R[rows, rows] += self.P[i + 1, k]
-        return Rows(z, H, self.factor * R, np.tile(np.repeat([POSITION, VELOCITY], 3), m))
+        labels = tuple(f"{self.names[i + 1]} {axis}" for i in followers for axis in (*"xyz", *"xyz"))
+        return Rows(z, H, self.factor * R, np.tile(np.repeat([POSITION, VELOCITY], 3), m), labels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,6 +250,7 @@ class RangeRow:
     arm_e: Array  # of b less that of a
     range_m: float
     sigma_m: float
+    label: str
 
 
 class Distances:
@@ -266,6 +274,7 @@ class Distances:
             np.zeros((m, self.n)),
             np.diag([one.sigma_m**2 for one in found]),
             np.full(m, RANGE),
+            tuple(one.label for one in found),
             np.arange(m),
             D,
             np.array([one.arm_e for one in found]),
@@ -281,6 +290,7 @@ class HeightRow:
     up_e: Array
     height_m: float
     sigma_m: float
+    label: str
 
 
 class Heights:
@@ -297,22 +307,10 @@ class Heights:
         for row, one in enumerate(found):
             H[row, position(one.follower)] = one.up_e
         z, sigma = np.array([(one.height_m, one.sigma_m) for one in found]).T
-        return Rows(z, H, np.diag(sigma**2), np.full(len(found), HEIGHT))
+        return Rows(z, H, np.diag(sigma**2), np.full(len(found), HEIGHT), tuple(one.label for one in found))
 
 
 def arms(C_eb: Array, w_b: Array, lever_b: Array) -> tuple[Array, Array]:
     """Arm (K, 3) and its velocity (K, 3) in Earth-fixed axes of attitudes (K, 3, 3) and inertial rates (K, 3)."""
     arm = C_eb @ lever_b
     return arm, np.einsum("kij,kj->ki", C_eb, np.cross(w_b, lever_b)) - np.cross(EARTH_RATE, arm)
-
-
-@dataclass(frozen=True, slots=True)
-class RowSettings:
-    """Which measurements are used, and how they are told."""
-
-    absolute_factor: float = 4.0  # on the covariance of the differences of the vehicles' own filters; 0: they are left out
-    range_scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        not_negative(self, "absolute_factor")
-        positive(self, "range_scale")

@@ -1,0 +1,347 @@
+"""The relative filter on a navigation problem: which vehicle is the reference, what is measured when, and the run.
+
+    vehicles    attitude and specific force at the rate of the IMU, and a position and velocity of each one's own (`OwnMotion`)
+    epochs      times of GNSS, ranges and heights, and between them so that no step is longer than LONGEST_STEP_S
+    rows        double differences against the reference, absolute differences, ranges, heights
+
+The reference is that of the first link. Without links it is the first vehicle; where anchors are heard, the ground at the origin
+of n: every vehicle is then a follower of it, and pairs are differences of followers. What the filter is told is the problem's:
+noise of receivers, IMUs and ranges. A range's bias and scale are not estimated, as in the source.
+
+`prepare` does what all configurations share, `Formation.run` filters. Source: Lu et al. (2024); spec ahrs_tdo.md, sections 1,
+2.7 and 2.8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from factorgraph.attitude import matrix_from_quat
+from factorgraph.errors import InputError, positive
+from factorgraph.filters.relative import filtering
+from factorgraph.filters.relative.filtering import Correct, Options, RelativeTrack, Update
+from factorgraph.filters.relative.motion import PERFECT, AccelModel, AttitudeReferenced, Motion, Mover, Smooth
+from factorgraph.filters.relative.rows import (
+    KINDS,
+    MATCH_S,
+    AbsoluteDifferences,
+    CodeAndRate,
+    Distances,
+    HeightRow,
+    Heights,
+    PairNoise,
+    Places,
+    RangeRow,
+    Source,
+    arms,
+    nearest_epoch,
+)
+from factorgraph.geodesy import LocalFrame
+from factorgraph.grid import subdivided
+from factorgraph.models.double_differences import PairEpochs, pair_epochs
+from factorgraph.models.receivers import Receiver
+from factorgraph.problem import NavigationProblem, RangeModel, Vehicle
+from factorgraph.types import Array, IntArray
+
+GROUND = "the ground"  # as a reference
+LONGEST_STEP_S = 1.0
+START_SIGMA = (100.0, 10.0)  # m, m/s of a start without any position
+
+
+@dataclass(frozen=True, slots=True)
+class OwnTrack:
+    """Where a vehicle's own filter has it, at its epochs."""
+
+    t_s: Array  # (K,)
+    r_n: Array  # (K, 3) of the body
+    v_n: Array  # (K, 3)
+    P: Array  # (K, 6, 6)
+
+
+@dataclass(frozen=True, slots=True)
+class OwnMotion:
+    """What a vehicle tells of itself: sample k holds from edges[k] to edges[k + 1]."""
+
+    edges: Array  # (n + 1,)
+    f_b: Array  # (n, 3) mean specific force, calibrated
+    w_b: Array  # (n, 3) mean inertial rate, calibrated
+    C_nb: Array  # (n, 3, 3) at the middle of the sample
+    model: AccelModel
+    track: OwnTrack | None  # None: without absolute position
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """One relative filter. Source: spec ahrs_tdo.md, section 2.8."""
+
+    motion: Literal["attitude", "velocity", "acceleration"] = "attitude"
+    walk: float = 1.0  # of constant velocity [m/s per sqrt(s)] or acceleration [m/s^2 per sqrt(s)]
+    kinds: tuple[str, ...] = KINDS  # measurements used
+    absolute_factor: float = 4.0  # on the covariance of absolute differences, which share their code with double differences
+    range_scale: float = 1.0  # of the crystal, where it is known
+    strong_tracking: bool = False
+
+    def __post_init__(self) -> None:
+        positive(self, "walk", "absolute_factor", "range_scale")
+        unknown = sorted(set(self.kinds) - set(KINDS))
+        if unknown:
+            raise InputError(f"no measurements called {unknown[0]}; there are {', '.join(KINDS)}")
+
+
+@dataclass(frozen=True, slots=True)
+class Formation:
+    """A flight ready for relative filters."""
+
+    problem: NavigationProblem
+    names: tuple[str, ...]  # the reference first
+    t_s: Array  # (K,) epochs
+    movers: tuple[Mover, ...]
+    places: Places
+    own: tuple[OwnTrack | None, ...]
+    absolute: tuple[Array, Array, Array]  # (N, K, 3), (N, K, 3), (N, K, 6, 6), ECEF; NaN where unknown
+    links: dict[int, PairEpochs]  # by follower
+    noise: dict[int, PairNoise]
+    ranges: dict[int, list[RangeRow]]  # by epoch
+    heights: dict[int, list[HeightRow]]
+    notes: tuple[str, ...]
+
+    def run(
+        self, configuration: Configuration, correct: Correct | None = None, observe: Callable[[int, Update], None] | None = None
+    ) -> RelativeTrack:
+        """Filter the flight."""
+        moving = self._motion(configuration)
+        sources = self._sources(configuration, moving.size)
+        options = Options(correct, configuration.strong_tracking, observe)
+        return filtering.run(moving, sources, self.t_s, self._start(), options)
+
+    def _motion(self, c: Configuration) -> Motion:
+        if c.motion == "attitude":
+            return AttitudeReferenced(self.movers, self.t_s, self.places.reference_e)
+        return Smooth(c.motion, len(self.names) - 1, self.t_s, c.walk)
+
+    def _sources(self, c: Configuration, n: int) -> list[Source]:
+        """Sources in the order of the publication's rows: double differences, absolute differences, ranges."""
+        sources: list[Source] = []
+        if self.links and {"code", "doppler"} & set(c.kinds):
+            sources.append(CodeAndRate(self.links, self.noise, self.places, self.problem.frame, self.t_s, self.names, n))
+        if "position" in c.kinds:
+            sources.append(AbsoluteDifferences(*self.absolute, self.names, n, c.absolute_factor))
+        if "range" in c.kinds:
+            sources.append(Distances(self.ranges, n, c.range_scale))
+        if "height" in c.kinds:
+            sources.append(Heights(self.heights, n))
+        return sources
+
+    def _start(self) -> tuple[Array, Array]:
+        """Followers' velocities and positions at the first epoch, with their covariance: what the own filters say."""
+        M = len(self.names) - 1
+        r_e, v_e, P = self.absolute
+        x, cov = np.zeros(6 * M), np.zeros((6 * M, 6 * M))
+        swap = np.r_[3:6, 0:3]  # own filters have positions first
+        known = [bool(np.all(np.isfinite(r_e[i, 0]))) for i in range(M + 1)]
+        for i in range(M):
+            mine = slice(6 * i, 6 * i + 6)
+            if not (known[0] and known[i + 1]):
+                cov[mine, mine] = np.diag(np.repeat([START_SIGMA[1] ** 2, START_SIGMA[0] ** 2], 3))
+                continue
+            x[mine] = np.concatenate([v_e[i + 1, 0] - v_e[0, 0], r_e[i + 1, 0] - r_e[0, 0]])
+            for j in range(M):
+                if known[j + 1]:
+                    shared = P[0, 0] + (P[i + 1, 0] if i == j else 0.0)
+                    cov[mine, 6 * j : 6 * j + 6] = shared[np.ix_(swap, swap)]
+        return x, cov
+
+
+def prepare(problem: NavigationProblem, motions: Mapping[str, OwnMotion], receivers: Mapping[str, Receiver]) -> Formation:
+    """A flight for relative filters: `motions` of every moving vehicle, `receivers` of those with GNSS.
+
+    Raises InputError where there is nothing to filter, or where a vehicle's samples do not cover the epochs.
+    """
+    moving = [v for v in problem.bodies if not v.is_fixed]
+    anchored = any(tag.position_n is not None for model in problem.ranges for tag in model.stream.tags)
+    names = _order(problem, moving, anchored and not problem.links)
+    missing = [name for name in names if name != GROUND and name not in motions]
+    if missing:
+        raise InputError(f"vehicle {missing[0]}: the relative filter needs its attitude and specific force, so an IMU")
+    frame = problem.frame
+    links = {
+        names.index(k.rover) - 1: pair_epochs(receivers[k.reference], receivers[k.rover], problem.settings, needs_phase=False)
+        for k in problem.links
+        if k.reference == names[0] and k.rover in names and {k.reference, k.rover} <= set(receivers)
+    }
+    t_s = _epochs(problem, names, motions, links)
+    full = {name: motions[name] for name in names if name != GROUND}
+    if names[0] == GROUND:
+        full[GROUND] = _ground(frame, t_s)
+    at = [_held(full[name], t_s, frame) for name in names]
+    levers = [receivers[name].lever_b if name in receivers else (0.0, 0.0, 0.0) for name in names]
+    turning = [arms(C, w, np.asarray(lever)) for (_, _, C, w), lever in zip(at, levers, strict=True)]
+    places = Places(at[0][0], at[0][1], np.array([a for a, _ in turning]), np.array([v for _, v in turning]))
+    ranges, skipped = _ranges(problem, names, t_s, [C for _, _, C, _ in at], frame)
+    return Formation(
+        problem=problem,
+        names=names,
+        t_s=t_s,
+        movers=tuple(_mover(name, full[name], frame) for name in names),
+        places=places,
+        own=tuple(full[name].track for name in names),
+        absolute=_absolute([full[name].track for name in names], t_s, frame),
+        links=links,
+        noise={i: PairNoise(receivers[names[0]].antenna.noise, receivers[names[i + 1]].antenna.noise) for i in links},
+        ranges=ranges,
+        heights=_heights(problem, names, t_s) if names[0] == GROUND else {},
+        notes=(f"{skipped} ranges to tags that this filter does not place were left out",) if skipped else (),
+    )
+
+
+def _order(problem: NavigationProblem, moving: Sequence[Vehicle], on_ground: bool) -> tuple[str, ...]:
+    """Names, the reference first."""
+    names = [v.name for v in moving]
+    if on_ground:
+        return (GROUND, *names)
+    if len(names) < 2:
+        raise InputError(f"a relative filter needs two moving vehicles or anchors; there is {names[0] if names else 'none'}")
+    first = problem.links[0].reference if problem.links and problem.links[0].reference in names else names[0]
+    return (first, *(name for name in names if name != first))
+
+
+def _epochs(
+    problem: NavigationProblem, names: Sequence[str], motions: Mapping[str, OwnMotion], links: Mapping[int, PairEpochs]
+) -> Array:
+    """Times (K,) of measurements, merged within MATCH_S, with others between them."""
+    times = [pair.t_rover_s for pair in links.values()]
+    times += [model.stream.t_s for model in problem.ranges]
+    times += [h.t_s for v in problem.vehicles for h in v.heights]
+    times += [track.t_s for name in names if name in motions and (track := motions[name].track) is not None]
+    wanted = np.unique(np.round(np.concatenate([np.zeros(0), *times]) / MATCH_S) * MATCH_S)
+    first = max(motions[name].edges[0] for name in names if name in motions)
+    last = min(motions[name].edges[-1] for name in names if name in motions)
+    wanted = wanted[(wanted >= first - 1e-6) & (wanted <= last + 1e-6)]
+    if len(wanted) < 2:
+        raise InputError(f"no measurements between {first:.1f} and {last:.1f} s, where all vehicles have IMU and attitude")
+    return subdivided(wanted, LONGEST_STEP_S)
+
+
+def _ground(frame: LocalFrame, t_s: Array) -> OwnMotion:
+    """A reference that stands at the origin of n."""
+    edges = np.array([t_s[0] - 1.0, t_s[-1] + 1.0])
+    w = frame.w_ie_n[None]
+    track = OwnTrack(t_s, np.zeros((len(t_s), 3)), np.zeros((len(t_s), 3)), np.zeros((len(t_s), 6, 6)))
+    return OwnMotion(edges, -frame.gravity(np.zeros((1, 3))), w, np.eye(3)[None], PERFECT, track)
+
+
+def _held(own: OwnMotion, t_s: Array, frame: LocalFrame) -> tuple[Array, Array, Array, Array]:
+    """Position and velocity (K, 3), ECEF, carried from the own filter's latest epoch; attitude (K, 3, 3) and rate (K, 3)."""
+    sample = np.clip(np.searchsorted(own.edges, t_s) - 1, 0, len(own.f_b) - 1)
+    C = frame.C_en.T @ own.C_nb[sample]
+    if own.track is None:
+        return np.tile(frame.origin_ecef, (len(t_s), 1)), np.zeros((len(t_s), 3)), C, own.w_b[sample]
+    track = own.track
+    last = np.clip(np.searchsorted(track.t_s, t_s + MATCH_S) - 1, 0, len(track.t_s) - 1)
+    r_n = track.r_n[last] + track.v_n[last] * (t_s - track.t_s[last])[:, None]
+    return frame.to_ecef(r_n), frame.rotate_to_ecef(track.v_n[last]), C, own.w_b[sample]
+
+
+def _mover(name: str, own: OwnMotion, frame: LocalFrame) -> Mover:
+    C_eb = np.ascontiguousarray(frame.C_en.T @ own.C_nb)
+    return Mover(name, own.edges, np.einsum("kij,kj->ki", C_eb, own.f_b), C_eb, own.model, frame.C_en)
+
+
+def _absolute(tracks: Sequence[OwnTrack | None], t_s: Array, frame: LocalFrame) -> tuple[Array, Array, Array]:
+    N, K = len(tracks), len(t_s)
+    r_e, v_e, P = np.full((N, K, 3), np.nan), np.full((N, K, 3), np.nan), np.full((N, K, 6, 6), np.nan)
+    turn = np.kron(np.eye(2), frame.C_en.T)
+    for i, track in enumerate(tracks):
+        if track is not None:
+            at = nearest_epoch(track.t_s, t_s)
+            has = at >= 0
+            r_e[i, has], v_e[i, has] = frame.to_ecef(track.r_n[at[has]]), frame.rotate_to_ecef(track.v_n[at[has]])
+            P[i, has] = turn @ track.P[at[has]] @ turn.T
+    return r_e, v_e, P
+
+
+def _ranges(
+    problem: NavigationProblem, names: Sequence[str], t_s: Array, C_eb: Sequence[Array], frame: LocalFrame
+) -> tuple[dict[int, list[RangeRow]], int]:
+    """Ranges by epoch, and how many are left out because an end is not placed."""
+    found: dict[int, list[RangeRow]] = {}
+    skipped = 0
+    for model in problem.ranges:
+        skipped += _ranges_of(model, names, t_s, C_eb, frame, found)
+    return found, skipped
+
+
+def _ranges_of(
+    model: RangeModel,
+    names: Sequence[str],
+    t_s: Array,
+    C_eb: Sequence[Array],
+    frame: LocalFrame,
+    found: dict[int, list[RangeRow]],
+) -> int:
+    stream, skipped = model.stream, 0
+    epoch = _epoch_of(stream.t_s, t_s)
+    places: list[tuple[int, Array] | None] = []
+    for tag in stream.tags:
+        if tag.vehicle is not None and tag.vehicle in names:
+            places.append((names.index(tag.vehicle), np.asarray(tag.lever_b, float)))
+        elif tag.position_n is not None and names[0] == GROUND:
+            places.append((0, np.asarray(tag.position_n, float)))
+        else:
+            places.append(None)
+    for k, a, b, range_m, sigma_m in zip(epoch, stream.tag_a, stream.tag_b, stream.range_m, stream.sigma_m, strict=True):
+        if k < 0:
+            continue
+        ends = places[a], places[b]
+        if ends[0] is None or ends[1] is None or ends[0][0] == ends[1][0]:
+            skipped += 1
+            continue
+        (i, lever_a), (j, lever_b) = ends[0], ends[1]
+        arm = C_eb[j][k] @ lever_b - C_eb[i][k] @ lever_a
+        label = f"{stream.tags[a].name}-{stream.tags[b].name}"
+        found.setdefault(int(k), []).append(RangeRow(i, j, arm, float(range_m), float(sigma_m), label))
+    return skipped
+
+
+def _heights(problem: NavigationProblem, names: Sequence[str], t_s: Array) -> dict[int, list[HeightRow]]:
+    """Heights over the ground by epoch."""
+    found: dict[int, list[HeightRow]] = {}
+    up = problem.frame.C_en[2]
+    for i, name in enumerate(names[1:]):
+        for stream in problem.vehicle(name).heights:
+            for k, height, sigma in zip(_epoch_of(stream.t_s, t_s), stream.up_m, stream.sigma_m, strict=True):
+                if k >= 0:
+                    found.setdefault(int(k), []).append(HeightRow(i, up, float(height), float(sigma), f"{name}/{stream.name}"))
+    return found
+
+
+def _epoch_of(t_s: Array, epochs_s: Array) -> IntArray:
+    """Of each time (n,) the epoch it belongs to, -1 for those before the first or after the last."""
+    near = np.clip(np.searchsorted(epochs_s, t_s - MATCH_S), 0, len(epochs_s) - 1)
+    return np.where(np.abs(epochs_s[near] - t_s) <= MATCH_S, near, -1)
+
+
+def truth_of(formation: Formation, reference: str, rover: str) -> tuple[Array, Array] | None:
+    """True position and velocity (K, 3), ECEF, of rover less reference at the epochs, NaN outside the truth; None without one."""
+    out_r, out_v = np.zeros((2, len(formation.t_s), 3))
+    for name, sign in ((rover, 1.0), (reference, -1.0)):
+        truth = formation.problem.vehicle(name).truth
+        if truth is None or truth.v_n is None:
+            return None
+        at = nearest_epoch(truth.t_s, formation.t_s)
+        for out, values in ((out_r, truth.r_n), (out_v, truth.v_n)):
+            out += sign * np.where((at >= 0)[:, None], values[np.maximum(at, 0)], np.nan)
+    to_e = formation.problem.frame.rotate_to_ecef
+    return to_e(out_r), to_e(out_v)
+
+
+def attitude_at(t_s: Array, q_nb: Array, at_s: Array) -> Array:
+    """Rotation matrices (m, 3, 3) at times at_s (m,) of quaternions (n, 4): straight between neighbours, which are near."""
+    sign = np.cumprod(np.concatenate([[1.0], np.where(np.sum(q_nb[1:] * q_nb[:-1], axis=1) < 0, -1.0, 1.0)]))
+    q = q_nb * sign[:, None]
+    mixed = np.column_stack([np.interp(at_s, t_s, q[:, j]) for j in range(4)])
+    return matrix_from_quat(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
