@@ -48,6 +48,11 @@ OURS = (
     ("moving-horizon", f"{LEAST_SQUARES}horizon:Horizon", "least squares over a sliding window, epoch by epoch"),
     ("eskf-passes", f"{FILTERS}passes:InPasses", "error-state Kalman filter in passes, without robust losses: for many flights"),
     ("ieks", f"{FILTERS}recursive:IteratedSmoother", "iterated Kalman smoother: the optimum of the whole flight by filters"),
+    (
+        "relative",
+        f"{FILTERS}relative.method:RELATIVE",
+        "relative filter: attitudes and accelerometers of all vehicles, two or many",
+    ),
     *((name, f"{FILTERS}methods:{name}", summary) for name, summary in RECURSIVE.items()),
     *((f"{name}-rts", f"{FILTERS}methods:{name}-rts", f"{summary}, smoothed") for name, summary in RECURSIVE.items()),
 )

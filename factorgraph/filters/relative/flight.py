@@ -24,7 +24,16 @@ from factorgraph.attitude import matrix_from_quat
 from factorgraph.errors import InputError, positive
 from factorgraph.filters.relative import filtering
 from factorgraph.filters.relative.filtering import Correct, Options, RelativeTrack, Update
-from factorgraph.filters.relative.motion import PERFECT, AccelModel, AttitudeReferenced, Motion, Mover, Smooth
+from factorgraph.filters.relative.motion import (
+    PERFECT,
+    AccelModel,
+    AttitudeReferenced,
+    Increments,
+    Motion,
+    Mover,
+    Smooth,
+    integrate,
+)
 from factorgraph.filters.relative.rows import (
     KINDS,
     MATCH_S,
@@ -100,6 +109,7 @@ class Formation:
     names: tuple[str, ...]  # the reference first
     t_s: Array  # (K,) epochs
     movers: tuple[Mover, ...]
+    increments: tuple[Increments, ...]  # of the movers between the epochs
     places: Places
     own: tuple[OwnTrack | None, ...]
     absolute: tuple[Array, Array, Array]  # (N, K, 3), (N, K, 3), (N, K, 6, 6), ECEF; NaN where unknown
@@ -120,7 +130,7 @@ class Formation:
 
     def _motion(self, c: Configuration) -> Motion:
         if c.motion == "attitude":
-            return AttitudeReferenced(self.movers, self.t_s, self.places.reference_e)
+            return AttitudeReferenced(self.movers, self.t_s, self.places.reference_e, self.increments)
         return Smooth(c.motion, len(self.names) - 1, self.t_s, c.walk)
 
     def _sources(self, c: Configuration, n: int) -> list[Source]:
@@ -181,12 +191,14 @@ def prepare(problem: NavigationProblem, motions: Mapping[str, OwnMotion], receiv
     levers = [receivers[name].lever_b if name in receivers else (0.0, 0.0, 0.0) for name in names]
     turning = [arms(C, w, np.asarray(lever)) for (_, _, C, w), lever in zip(at, levers, strict=True)]
     places = Places(at[0][0], at[0][1], np.array([a for a, _ in turning]), np.array([v for _, v in turning]))
+    movers = tuple(_mover(name, full[name], frame) for name in names)
     ranges, skipped = _ranges(problem, names, t_s, [C for _, _, C, _ in at], frame)
     return Formation(
         problem=problem,
         names=names,
         t_s=t_s,
-        movers=tuple(_mover(name, full[name], frame) for name in names),
+        movers=movers,
+        increments=tuple(integrate(mover, t_s) for mover in movers),
         places=places,
         own=tuple(full[name].track for name in names),
         absolute=_absolute([full[name].track for name in names], t_s, frame),

@@ -38,6 +38,7 @@ from factorgraph.geodesy import OMEGA_E_RPS, centrifugal_ecef, gravitation_ecef
 from factorgraph.types import Array
 
 EARTH_RATE = np.array([0.0, 0.0, OMEGA_E_RPS])  # ECEF
+TURN = skew(EARTH_RATE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,16 +180,20 @@ def error(M: int, j: int) -> slice:
 class AttitudeReferenced:
     """Dead reckoning of all vehicles with their attitudes and accelerometers.
 
-    reference_e (K + 1, 3): where the reference is, ECEF, for gravity; a hundred metres are near enough.
+    reference_e (K + 1, 3): where the reference is, ECEF, for gravity; a hundred metres are near enough. `increments`: what
+    `integrate` gave for the same movers and times, to save time.
     """
 
-    def __init__(self, movers: Sequence[Mover], t_s: Array, reference_e: Array) -> None:
+    def __init__(
+        self, movers: Sequence[Mover], t_s: Array, reference_e: Array, increments: Sequence[Increments] | None = None
+    ) -> None:
         if len(movers) < 2:
             raise InputError("a formation needs a reference and at least one follower")
         self.n_followers = len(movers) - 1
         self.size = 6 * self.n_followers + 3 * len(movers)
         self.movers, self.t_s, self.reference_e = tuple(movers), t_s, reference_e
-        self.increments = [integrate(mover, t_s) for mover in movers]
+        self.increments = increments or [integrate(mover, t_s) for mover in movers]
+        self._gradient = _gravity_gradient(reference_e[len(reference_e) // 2])
 
     def start(self) -> Array:
         return np.diag(np.repeat([m.model.markov_mps2**2 for m in self.movers], 3))
@@ -197,11 +202,10 @@ class AttitudeReferenced:
         M, T = self.n_followers, float(self.t_s[k] - self.t_s[k - 1])
         Phi, Q = np.zeros((self.size, self.size)), np.zeros((self.size, self.size))
         own = [(part.Phi[k - 1], part.Q[k - 1]) for part in self.increments]
-        turn = skew(EARTH_RATE)
-        gradient = _gravity_gradient(self.reference_e[k - 1])
+        gradient = self._gradient
         pair = np.eye(6)
-        pair[:3, :3] -= 2.0 * T * turn
-        pair[3:, :3] = T * np.eye(3) - T * T * turn
+        pair[:3, :3] -= 2.0 * T * TURN
+        pair[3:, :3] = T * np.eye(3) - T * T * TURN
         pair[:3, 3:] = T * gradient
         pair[3:, 3:] += 0.5 * T * T * gradient
         for i in range(M):
@@ -224,10 +228,12 @@ class AttitudeReferenced:
     def _gained(self, k: int, vehicle: int, r: Array, T: float) -> tuple[Array, Array]:
         """Velocity and way gained against the reference in interval k, beside what velocity and df bring."""
         a, b, place = self.increments[0], self.increments[vehicle], self.reference_e[k]
-        pull = _gravity(place + r) - _gravity(place) - _gravity_gradient(place) @ r
+        ends = _gravity(np.array([place, place + r]))
+        pull = ends[1] - ends[0] - self._gradient @ r
         dr = b.dr[k] - a.dr[k] + 0.5 * pull * T * T
         dv = b.dv[k] - a.dv[k] + pull * T
-        return dv - 2.0 * np.cross(EARTH_RATE, dr), dr - np.cross(EARTH_RATE, dr) * (2.0 * T / 3.0)
+        turned = TURN @ dr
+        return dv - 2.0 * turned, dr - (2.0 * T / 3.0) * turned
 
 
 def _gravity(r_e: Array) -> Array:

@@ -127,48 +127,43 @@ class CodeAndRate:
         self, data: dict[int, PairEpochs], noise: dict[int, PairNoise], places: Places, frame: LocalFrame,
         epochs_s: Array, names: tuple[str, ...], n: int,
     ) -> None:  # fmt: skip
-        self.data, self.noise, self.places, self.frame, self.n = data, noise, places, frame, n
-        self.epochs_s, self.names = epochs_s, names
-        self.epoch = {i: nearest_epoch(pair.t_rover_s, epochs_s) for i, pair in data.items()}
+        self.links = {i: _Link.of(pair, noise[i], frame, epochs_s) for i, pair in data.items()}
+        self.places, self.epochs_s, self.names, self.n = places, epochs_s, names, n
+        self.satellites = sorted({name for pair in data.values() for name in pair.satellites})
 
     def rows(self, k: int, x: Array) -> Rows | None:
-        seen = [(i, int(self.epoch[i][k])) for i in self.data if self.epoch[i][k] >= 0]
-        found = [(i, j, self.data[i].order(j)) for i, j in seen]
-        found = [one for one in found if len(one[2]) >= FEWEST]
+        seen = [(i, link, int(link.epoch[k])) for i, link in self.links.items() if link.epoch[k] >= 0]
+        found = [(i, link, j, link.pair.order(j)) for i, link, j in seen]
+        found = [one for one in found if len(one[3]) >= FEWEST]
         if not found:
             return None
-        parts = [self._of_link(i, j, k, order, x) for i, j, order in found]
-        m = [len(part[0]) for part in parts]
-        z = np.concatenate([np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])])
-        H = np.concatenate([np.concatenate([part[2] for part in parts]), np.concatenate([part[3] for part in parts])])
-        kind = np.repeat([CODE, DOPPLER], sum(m))
-        R = np.zeros((2 * sum(m), 2 * sum(m)))
-        for block, name in enumerate(("code_m", "doppler_mps")):
-            rows = slice(block * sum(m), (block + 1) * sum(m))
-            R[rows, rows] = self._noise(found, name)
-        return Rows(z, H, R, kind, 2 * tuple(label for i, _, order in found for label in self._labels(i, order)))
+        parts = [self._of_link(i, link, j, k, order, x) for i, link, j, order in found]
+        code, rate, H_code, H_rate = (np.concatenate(column) for column in zip(*parts, strict=True))
+        m = len(code)
+        R = np.zeros((2 * m, 2 * m))
+        R[:m, :m] = self._noise([(link, link.code_m, j, order) for _, link, j, order in found])
+        R[m:, m:] = self._noise([(link, link.doppler_mps, j, order) for _, link, j, order in found])
+        labels = tuple(label for i, link, _, order in found for label in self._labels(i, link, order))
+        return Rows(
+            np.concatenate([code, rate]), np.concatenate([H_code, H_rate]), R, np.repeat([CODE, DOPPLER], m), labels + labels
+        )
 
-    def _labels(self, i: int, order: IntArray) -> list[str]:
-        satellites = self.data[i].satellites
+    def _labels(self, i: int, link: _Link, order: IntArray) -> list[str]:
+        satellites = link.pair.satellites
         return [f"{self.names[i + 1]} {satellites[s]}-{satellites[order[0]]}" for s in order[1:]]
 
-    def _of_link(self, i: int, j: int, k: int, order: IntArray, x: Array) -> tuple[Array, Array, Array, Array]:
+    def _of_link(self, i: int, link: _Link, j: int, k: int, order: IntArray, x: Array) -> tuple[Array, Array, Array, Array]:
         """Code and rate (m,) as linear rows (m, n), of follower i at epoch j of its link and k of ours."""
-        pair, places = self.data[i], self.places
-        to_n = self.frame.rotate_from_ecef
+        pair, places = link.pair, self.places
         v, r = velocity(i), position(i)
-        late = np.array([pair.t_reference_s[j], pair.t_rover_s[j]]) - self.epochs_s[k]
         va = places.reference_v_e[k] + places.arm_v_e[0, k]
         vb = places.reference_v_e[k] + x[v] + places.arm_v_e[i + 1, k]
-        ra = places.reference_e[k] + places.arm_e[0, k] + late[0] * va
-        rb = places.reference_e[k] + x[r] + places.arm_e[i + 1, k] + late[1] * vb
-        rho, rate, G_n = dd.predict(
-            pair.sat_reference[j], pair.sat_rover[j], pair.vel_reference[j], pair.vel_rover[j], order,
-            self.frame.from_ecef(ra), to_n(va), self.frame.from_ecef(rb), to_n(vb),
-        )  # fmt: skip
-        G = self.frame.rotate_to_ecef(G_n)
-        G_rate = self.frame.rotate_to_ecef(
-            _sight_rates(pair, j, order, self.frame.from_ecef(0.5 * (ra + rb)), to_n(0.5 * (va + vb)))
+        ra = places.reference_e[k] + places.arm_e[0, k] + (pair.t_reference_s[j] - self.epochs_s[k]) * va
+        rb = places.reference_e[k] + x[r] + places.arm_e[i + 1, k] + (pair.t_rover_s[j] - self.epochs_s[k]) * vb
+        sat, speed = link.sat_e[:, j], link.vel_e[:, j]
+        rho, rate, G = dd.predict(sat[0], sat[1], speed[0], speed[1], order, ra, va, rb, vb)
+        G_rate = _sight_rates(
+            0.5 * (sat[0] + sat[1])[order], 0.5 * (speed[0] + speed[1])[order], 0.5 * (ra + rb), 0.5 * (va + vb)
         )
         H_code, H_rate = np.zeros((2, len(rho), self.n))
         H_code[:, r], H_rate[:, v], H_rate[:, r] = G, G, G_rate
@@ -176,40 +171,53 @@ class CodeAndRate:
         doppler = dd.difference(pair.rate_mps[j], order) - rate + G @ x[v] + G_rate @ x[r]
         return code, doppler, H_code, H_rate
 
-    def _noise(self, found: list[tuple[int, int, IntArray]], name: str) -> Array:
-        """R of one quantity, links after each other: D diag(sigma^2) D' with the reference's satellites in common."""
-        undifferenced: dict[tuple[int, str], int] = {}
-        variance: list[float] = []
-        entries: list[tuple[int, int, float]] = []
+    def _noise(self, found: list[tuple[_Link, Array, int, IntArray]]) -> Array:
+        """R of one quantity with undifferenced sigmas (2, J, S), links after each other; they share the reference's noise."""
+        S = len(self.satellites)
+        variance = np.zeros(S * (1 + len(found)))
+        D = np.zeros((sum(len(order) - 1 for *_, order in found), len(variance)))
         row = 0
-        for i, j, order in found:
-            pair, noise = self.data[i], self.noise[i]
-            for s in order:
-                for vehicle, told in ((-1, noise.reference), (i, noise.rover)):
-                    key = (vehicle, pair.satellites[s])
-                    if key not in undifferenced:
-                        undifferenced[key] = len(variance)
-                        scale = elevation_scale(pair.elevation_rad[j, s : s + 1], told.elevation)[0]
-                        variance.append((getattr(told, name) * float(scale)) ** 2)
-            for s in order[1:]:
-                for satellite, sign in ((s, 1.0), (order[0], -1.0)):
-                    entries.append((row, undifferenced[i, pair.satellites[satellite]], sign))
-                    entries.append((row, undifferenced[-1, pair.satellites[satellite]], -sign))
-                row += 1
-        D = np.zeros((row, len(variance)))
-        for at, column, sign in entries:
-            D[at, column] += sign
+        for number, (link, sigma, j, order) in enumerate(found):
+            column = np.array([self.satellites.index(link.pair.satellites[s]) for s in order])
+            for start, sign, end in ((0, -1.0, 0), (S * (1 + number), 1.0, 1)):
+                variance[start + column] = sigma[end, j, order] ** 2
+                rows = np.arange(row, row + len(order) - 1)
+                D[rows, start + column[1:]] = sign
+                D[rows, start + column[0]] = -sign
+            row += len(order) - 1
         return np.asarray((D * variance) @ D.T)
 
 
-def _sight_rates(pair: PairEpochs, j: int, order: IntArray, middle_n: Array, v_n: Array) -> Array:
-    """-(de_s - de_1)/dt (m, 3) in n: how fast the lines of sight turn, de/dt = (I - e e')(v_s - v) / rho."""
-    sat = 0.5 * (pair.sat_reference[j, order] + pair.sat_rover[j, order])
-    speed = 0.5 * (pair.vel_reference[j, order] + pair.vel_rover[j, order]) - v_n
-    way = sat - middle_n
-    rho = np.linalg.norm(way, axis=1, keepdims=True)
+@dataclass(frozen=True, slots=True)
+class _Link:
+    """A link with what does not change from run to run: J epochs, S satellites; reference first, rover second."""
+
+    pair: PairEpochs
+    epoch: IntArray  # (K,) of ours -> of the link, -1 without
+    sat_e: Array  # (2, J, S, 3) ECEF
+    vel_e: Array  # (2, J, S, 3)
+    code_m: Array  # (2, J, S) undifferenced standard deviations
+    doppler_mps: Array
+
+    @classmethod
+    def of(cls, pair: PairEpochs, noise: PairNoise, frame: LocalFrame, epochs_s: Array) -> _Link:
+        """Satellites turned to ECEF; the rover's elevations serve both receivers."""
+        told = (noise.reference, noise.rover)
+        scale = np.array([elevation_scale(pair.elevation_rad, one.elevation) for one in told])
+        code, doppler = (
+            np.array([getattr(one, name) for one in told])[:, None, None] * scale for name in ("code_m", "doppler_mps")
+        )
+        sat = frame.to_ecef(np.array([pair.sat_reference, pair.sat_rover]))
+        speed = frame.rotate_to_ecef(np.array([pair.vel_reference, pair.vel_rover]))
+        return cls(pair, nearest_epoch(pair.t_rover_s, epochs_s), sat, speed, code, doppler)
+
+
+def _sight_rates(sat: Array, speed: Array, middle: Array, v: Array) -> Array:
+    """-(de_s - de_1)/dt (m, 3): how fast the lines of sight turn, de/dt = (I - e e')(v_s - v) / rho, the pivot first."""
+    way, against = sat - middle, speed - v
+    rho = np.sqrt(np.einsum("si,si->s", way, way))[:, None]
     e = way / rho
-    turn = (speed - e * np.sum(e * speed, axis=1, keepdims=True)) / rho
+    turn = (against - e * np.einsum("si,si->s", e, against)[:, None]) / rho
     return np.asarray(turn[0] - turn[1:])
 
 
