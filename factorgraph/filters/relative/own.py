@@ -1,60 +1,117 @@
-"""What each vehicle tells of itself: attitude and specific force at the rate of its IMU, and its own filter's position."""
+"""What each vehicle tells of itself: attitude and specific force at the rate of its IMU, and where its own filter has it.
+
+The attitude is that of the vehicle's attitude system; without one, of the attitude filter `ahrs` of IMU and magnetometer. A
+vehicle with a receiver is followed by the filter of 20 states of `tightly_coupled`, which starts from the single-point
+solution and that attitude; what it estimates of the accelerometers' errors can be taken off the samples that follow.
+
+Source: spec ahrs_tdo.md, sections 1, 2.1 and 2.3.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from factorgraph.attitude import matrix_from_quat
 from factorgraph.errors import InputError
 from factorgraph.filters import tightly_coupled
-from factorgraph.filters.inertial import ImuModel, InertialStart
+from factorgraph.filters.inertial import INERTIAL, ImuModel
 from factorgraph.filters.relative.flight import OwnMotion, OwnTrack, attitude_at
 from factorgraph.filters.relative.motion import AccelModel
-from factorgraph.filters.tightly_coupled import TightSettings
+from factorgraph.filters.tightly_coupled import TightSettings, TightTrack, point_start
+from factorgraph.measurements import AttitudeStream
 from factorgraph.models.preintegration import sample_means
 from factorgraph.models.receivers import Receiver
-from factorgraph.problem import NavigationProblem, Vehicle
+from factorgraph.problem import ImuNoise, NavigationProblem, Vehicle
+from factorgraph.types import Array
+
+GYRO_MARKOV_S = 3600.0  # over which a walking gyro bias is said to return
+ACCEL = slice(INERTIAL["accel_markov"].start - INERTIAL["gyro_constant"].start, None)  # of a track's sensor errors
 
 
-def own_motions(problem: NavigationProblem, receivers: Mapping[str, Receiver]) -> dict[str, OwnMotion]:
-    """Of every moving vehicle with an IMU."""
-    return {v.name: own_motion(problem, v, receivers.get(v.name)) for v in problem.bodies if not v.is_fixed and v.imu is not None}
+@dataclass(frozen=True, slots=True)
+class OwnSettings:
+    """How vehicles are prepared."""
+
+    use_doppler: bool = True  # in the vehicles' own filters; the source has code alone
+    calibrate: bool = (
+        False  # take the own filter's accelerometer errors off, as the source does; their steps are no Markov process
+    )
 
 
-def own_motion(problem: NavigationProblem, vehicle: Vehicle, rx: Receiver | None) -> OwnMotion:
+def own_motions(
+    problem: NavigationProblem, receivers: Mapping[str, Receiver], settings: OwnSettings | None = None
+) -> dict[str, OwnMotion]:
+    """Of every moving vehicle with an IMU. Raises InputError where an attitude cannot be had."""
+    settings = settings or OwnSettings()
+    return {
+        v.name: own_motion(problem, v, receivers.get(v.name), settings)
+        for v in problem.bodies
+        if not v.is_fixed and v.imu is not None
+    }
+
+
+def own_motion(problem: NavigationProblem, vehicle: Vehicle, receiver: Receiver | None, settings: OwnSettings) -> OwnMotion:
+    """Of one vehicle. Raises InputError where its attitude cannot be had."""
     assert vehicle.imu is not None
     edges, f, w = sample_means(vehicle.imu)
-    if not vehicle.attitudes:
-        raise InputError(f"vehicle {vehicle.name}: no attitude")
-    at = vehicle.attitudes[0]
-    C = attitude_at(at.t_s, at.q_nb, 0.5 * (edges[1:] + edges[:-1]))
-    n = vehicle.imu_noise
-    dt = float(np.median(np.diff(at.t_s)))
-    east, north, up = (at.sigma_rad[0] * np.sqrt(dt)).tolist()
-    model = AccelModel(
-        n.accel_mps2_rthz, n.accel_bias_mps2, 2 * n.accel_bias_mps2**2 / n.accel_bias_walk_mps2_rts**2, (east, north, up)
+    attitude = told_attitude(vehicle)
+    C = attitude_at(attitude.t_s, attitude.q_nb, 0.5 * (edges[1:] + edges[:-1]))
+    east, north, up = (np.median(attitude.sigma_rad, axis=0) * np.sqrt(np.median(np.diff(attitude.t_s)))).tolist()
+    noise = vehicle.imu_noise
+    model = AccelModel(noise.accel_mps2_rthz, noise.accel_bias_mps2, _markov_s(noise), (east, north, up))
+    if receiver is None:
+        return OwnMotion(edges, f, w, C, model, None)
+    found = _follow(problem, receiver, attitude, settings)
+    if settings.calibrate:
+        f = f - _before(edges, found)
+    return OwnMotion(edges, f, w, C, model, OwnTrack(found.t_s, found.r_n, found.v_n, found.P[:, :6, :6]))
+
+
+def told_attitude(vehicle: Vehicle) -> AttitudeStream:
+    """The attitude system that tells all three angles."""
+    for stream in vehicle.attitudes:
+        if np.all(np.isfinite(stream.sigma_rad)) and len(stream.t_s) > 1:
+            return stream
+    raise InputError(f"vehicle {vehicle.name}: no attitude system tells roll, pitch and heading")
+
+
+def _markov_s(noise: ImuNoise) -> float:
+    """Correlation time of an accelerometer bias whose walk and steady standard deviation are told."""
+    return 2.0 * (noise.accel_bias_mps2 / noise.accel_bias_walk_mps2_rts) ** 2
+
+
+def _follow(problem: NavigationProblem, receiver: Receiver, attitude: AttitudeStream, settings: OwnSettings) -> TightTrack:
+    """The vehicle's own filter over the whole flight."""
+    imu, gnss = receiver.vehicle.imu_noise, receiver.antenna.noise
+    model = ImuModel(
+        gyro_rps_rthz=imu.gyro_rps_rthz,
+        accel_mps2_rthz=imu.accel_mps2_rthz,
+        gyro_constant_rps=imu.gyro_bias_rps,
+        gyro_markov_rps=imu.gyro_bias_walk_rps_rts * float(np.sqrt(GYRO_MARKOV_S / 2)),
+        gyro_markov_s=GYRO_MARKOV_S,
+        accel_markov_mps2=imu.accel_bias_mps2,
+        accel_markov_s=_markov_s(imu),
     )
-    track = None
-    if rx is not None:
-        im = ImuModel(
-            n.gyro_rps_rthz,
-            n.accel_mps2_rthz,
-            n.gyro_bias_rps,
-            n.gyro_bias_walk_rps_rts * np.sqrt(1800),
-            3600.0,
-            n.accel_bias_mps2,
-            3600.0,
-        )
-        r0, v0 = problem.frame.from_ecef(rx.point.r_ecef[0]), problem.frame.rotate_from_ecef(rx.point.v_ecef[0])
-        P = np.diag([25.0] * 3 + [0.01] * 3 + [4e-6, 4e-6, 3e-5])
-        tr = tightly_coupled.run(
-            rx,
-            problem.frame,
-            InertialStart(r0, v0, matrix_from_quat(at.q_nb[:1])[0], P),
-            im,
-            TightSettings(code_m=3.0, doppler_mps=0.03),
-        )
-        track = OwnTrack(tr.t_s, tr.r_n, tr.v_n, tr.P[:, :6, :6])
-    return OwnMotion(edges, f, w, C, model, track)
+    tight = TightSettings(
+        code_m=gnss.absolute_code_m, doppler_mps=gnss.doppler_mps, elevation=gnss.elevation, use_doppler=settings.use_doppler
+    )
+    first = np.searchsorted(attitude.t_s, receiver.antenna.stream.t_s[0])
+    at = min(int(first), len(attitude.t_s) - 1)
+    start = point_start(
+        receiver, problem.frame, matrix_from_quat(attitude.q_nb[at : at + 1])[0], np.diag(_first_sigma(attitude) ** 2)
+    )
+    return tightly_coupled.run(receiver, problem.frame, start, model, tight)
+
+
+def _first_sigma(attitude: AttitudeStream) -> Array:
+    """Standard deviation (3,) of one attitude: told ones count correlated samples once, which a single one need not."""
+    return np.asarray(attitude.sigma_rad[0])
+
+
+def _before(edges: Array, track: TightTrack) -> Array:
+    """Accelerometer errors (n, 3) as the own filter had them before each sample; zero before its first epoch."""
+    last = np.searchsorted(track.t_s, edges[:-1] + 1e-6) - 1
+    return np.where((last >= 0)[:, None], track.sensors[np.maximum(last, 0), ACCEL], 0.0)
