@@ -21,15 +21,26 @@ class Named:
 
 
 @dataclass(frozen=True, slots=True)
+class Family:
+    """Many choices under one pattern, which are not listed one by one."""
+
+    pattern: str  # as shown
+    names: tuple[str, ...]
+    module: str  # has each name as an attribute
+    summary: str
+
+
+@dataclass(frozen=True, slots=True)
 class Names:
-    """Choices of one kind: ours, and those of installed packages in an entry-point group."""
+    """Choices of one kind: ours, those of installed packages in an entry-point group, and families of them."""
 
     kind: str
     group: str
     built_in: tuple[Named, ...]
+    families: tuple[Family, ...] = ()
 
     def all(self) -> dict[str, Named]:
-        """By name, ours first; none is imported."""
+        """By name, ours first and without families; none is imported."""
         found = {choice.name: choice for choice in self.built_in}
         for entry in entry_points(group=self.group):
             found.setdefault(entry.name, Named(entry.name, entry.value, f"from {entry.dist.name if entry.dist else '?'}"))
@@ -38,11 +49,15 @@ class Names:
     def named(self, name: str) -> Named:
         """A choice by name, not imported. Raises InputError with the nearest name for an unknown one."""
         known = self.all()
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"; did you mean {near[0]}?" if near else "."
-            raise InputError(f"no {self.kind} named {name}{hint} There are: {', '.join(known)}")
-        return known[name]
+        if name in known:
+            return known[name]
+        for family in self.families:
+            if name in family.names:
+                return Named(name, f"{family.module}:{name}", family.summary)
+        near = difflib.get_close_matches(name, [*known, *(n for family in self.families for n in family.names)], n=1)
+        hint = f"; did you mean {near[0]}?" if near else "."
+        patterns = [family.pattern for family in self.families]
+        raise InputError(f"no {self.kind} named {name}{hint} There are: {', '.join([*known, *patterns])}")
 
     def create(self, name: str) -> Any:
         """An instance by name. Raises InputError as `named`."""

@@ -20,12 +20,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from factorgraph import registry
 from factorgraph.errors import InputError
 from factorgraph.measurements import ReadReport
 from factorgraph.problem import NavigationProblem, Settings
 from factorgraph.solution import Solution, Status
 from scenarios import guard
+from scenarios import methods as estimators
 from scenarios.cli import check_writable, describe_os_error
 from scenarios.overrides import override
 
@@ -133,7 +133,7 @@ def _check_figures(args: argparse.Namespace) -> None:
 
 def _estimate(args: argparse.Namespace, stages: Stages) -> tuple[NavigationProblem, Solution]:
     stages("loading the engine")
-    registry.create(args.method)  # what is wrong here is told before the files are read
+    estimators.create(args.method)  # what is wrong here is told before the files are read
     problem, doubts = read_problem(args, stages)
     stages("solving")
     return problem, solve(problem, doubts, args.method, stages)
@@ -155,7 +155,7 @@ def read_problem(args: argparse.Namespace, stages: Stages) -> tuple[NavigationPr
 def solve(problem: NavigationProblem, doubts: tuple[str, ...], method: str, stages: Stages) -> Solution:
     """The solution of a method, with what is doubtful in its input among the warnings."""
     try:
-        solution = registry.solve(problem, method, stages)
+        solution = estimators.solve(problem, method, stages)
     except InputError as error:
         raise InputError(f"{error}; doubtful in the flight: {doubts[0]}" if doubts else str(error)) from error
     return _with_doubts(solution, doubts)
@@ -322,7 +322,7 @@ def report(args: argparse.Namespace) -> int:
 
 def methods(args: argparse.Namespace) -> int:
     """List the estimators."""
-    print_catalogue("method", ((info.name, info.summary, info.path) for info in registry.methods().values()))
+    print_catalogue("method", ((info.name, info.summary, info.path) for info in estimators.methods()))
     return guard.DONE
 
 

@@ -30,11 +30,11 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from factorgraph import registry
 from factorgraph.errors import InputError
 from factorgraph.problem import NavigationProblem
 from factorgraph.solution import Status
 from scenarios import guard, solutions
+from scenarios import methods as estimators
 from scenarios.cli import check_writable
 from scenarios.commands import (
     SOLUTION,
@@ -111,7 +111,7 @@ def chosen(text: str) -> list[str]:
     if not names:
         raise InputError("say which methods to compare, as --methods graph,…; relnav methods lists them")
     for name in names:
-        registry.METHODS.named(name)
+        estimators.METHODS.named(name)
         if names.count(name) > 1:
             raise InputError(f"--methods names {name} twice; once is enough")
     return names
@@ -392,7 +392,7 @@ def run_part(args: argparse.Namespace) -> int:
             told: dict[str, object] = {}
         else:
             stages("loading the engine")
-            registry.create(args.methods)
+            estimators.create(args.methods)
             problem, doubts = read_problem(args, stages)
             told = _measured(problem, doubts, args, outputs, stages)
         told = {"fingerprint": fingerprint(problem), "relnav": relnav_version(), **told}

@@ -1,139 +1,206 @@
-"""Particle swarm: every particle is drawn to its own best point and to the swarm's.
+"""Particle swarm: every particle is drawn to its own best point and to the best one its neighbours know.
 
-    v <- w v + c1 r1 (own best - x) + c2 r2 (swarm best - x),   x <- x + v
+    v <- w v + c1 r1 (own best - x) + c2 r2 (neighbours' best - x),   x <- x + v
 
-with r1, r2 uniform in [0, 1) for each coordinate. A particle that leaves the box is mirrored at its wall and its velocity
-turned; speed is limited to half the box, so that one reflection suffices.
+with r1, r2 uniform in [0, 1) for each coordinate. Neighbours are all particles ("global") or one to each side ("ring": news
+travels slowly, so that several minima are looked at for longer). All particles move, then all are evaluated. A particle that
+leaves the box is mirrored at its wall and its velocity turned; speed is limited to half the box, so that one reflection suffices.
 
-Source: Kennedy and Eberhart (1995); Clerc and Kennedy (2002) for the coefficients of the constricted swarm.
+Compiled and Python costs see the same points, bit by bit.
+
+Source: Kennedy and Eberhart (1995); Kennedy and Mendes (2002) for the ring; Clerc and Kennedy (2002) for the coefficients of
+the constricted swarm.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Any, Literal
 
 import numpy as np
+from numba import njit
+from numba.core import types
 from numpy.typing import ArrayLike
 
-from swarm.result import SwarmResult, SwarmStatus
-from swarm.types import Array
+from swarm.box import box, check_count, check_range, first_points
+from swarm.compiled import ACCOUNT, COST, GENERATOR, MATRIX, VECTOR, CompiledCost, compiled_when_called
+from swarm.result import SwarmResult
+from swarm.search import CONVERGED, EVALS, Search, close, note
+from swarm.types import Array, Callback, Cost, IntArray
 
 W, C1, C2 = 0.7298, 1.49618, 1.49618
 MAX_STEP = 0.5  # of the box
-LARGEST_BOUND = 1e300  # beyond it the width of the box may overflow
+TOPOLOGIES = ("global", "ring")
 
 
 def minimize(
-    cost: Callable[[Array], Array],
+    cost: Cost | CompiledCost,
     bounds: ArrayLike,
     *,
     rng: np.random.Generator,
-    n_particles: int = 30,
-    max_evals: int = 5000,
+    max_evals: int = 24_000,
+    n_members: int = 30,
+    n_iter: int | None = None,
     x0: ArrayLike | None = None,
     target: float = -np.inf,
+    callback: Callback | None = None,
+    topology: Literal["global", "ring"] = "global",
     xtol: float = 1e-10,
     w: float = W,
     c1: float = C1,
     c2: float = C2,
 ) -> SwarmResult:
-    """Minimise a vectorised cost inside a box.
+    """Minimise a cost inside a box.
 
     Parameters
     ----------
-    cost : takes points (k, n), k <= n_particles, and returns their costs (k,); what is not finite counts as infinite
+    cost : takes points (k, n), k <= n_members, and returns their costs (k,), or a `CompiledCost`; what is not finite counts
+        as infinite
     bounds : (n, 2) lower and upper limit of each coordinate
     rng : source of all randomness
     max_evals : points the cost may see in all; never exceeded
+    n_iter : iterations after the first population; as many as the evaluations allow where None
     x0 : (n,) a first point inside the box, given to one particle
     target : stop once the best cost is this low
+    callback : hears of every population; the search stops where it returns True
+    topology : "global" or "ring"
     xtol : stop once all particles and their best points lie within this part of the box in every coordinate
-    w, c1, c2 : inertia, pull of the own best, pull of the swarm's best
+    w, c1, c2 : inertia, pull of the own best, pull of the neighbours' best
 
     Raises ValueError for bounds, options or costs of a wrong shape or value. Source: Clerc and Kennedy (2002).
     """
-    low, high = _box(bounds)
-    _check_options(n_particles, max_evals, xtol, w, c1, c2)
-    n, width, k = low.size, high - low, min(n_particles, max_evals)
-    x = np.clip(low + width * rng.random((k, n)), low, high)
-    if x0 is not None:
-        x[0] = _first_point(x0, low, high)
-    fastest = MAX_STEP * width
-    v = fastest * (2.0 * rng.random((k, n)) - 1.0)
-    f, n_invalid = _evaluate(cost, x)
-    own, own_cost = x.copy(), f
-    best = int(np.argmin(own_cost))
-    n_evals, history = k, [float(own_cost[best])]
-    while (status := _stop(own_cost[best], target, x, own, xtol * width)) is None and n_evals < max_evals:
-        k = min(k, max_evals - n_evals)
-        pull = c1 * rng.random((k, n)) * (own[:k] - x[:k]) + c2 * rng.random((k, n)) * (own[best] - x[:k])
-        v[:k] = np.clip(w * v[:k] + pull, -fastest, fastest)
-        x[:k], v[:k] = _reflect(x[:k] + v[:k], v[:k], low, high)
-        f, invalid = _evaluate(cost, x[:k])
-        n_evals, n_invalid = n_evals + k, n_invalid + invalid
-        better = np.flatnonzero(f < own_cost[:k])
-        own[better], own_cost[better] = x[better], f[better]
-        best = int(np.argmin(own_cost))
-        history.append(float(own_cost[best]))
-    if np.isinf(own_cost[best]):
-        status = SwarmStatus.NO_FINITE_COST
-    return SwarmResult(own[best].copy(), history[-1], n_evals, n_invalid, np.array(history), status or SwarmStatus.BUDGET)
+    low, high = box(bounds)
+    check_count("n_members", n_members, 1)
+    if topology not in TOPOLOGIES:
+        raise ValueError(f"topology must be one of {', '.join(TOPOLOGIES)}, got {topology}")
+    for name, value in (("xtol", xtol), ("w", w), ("c1", c1), ("c2", c2)):
+        check_range(name, value, 0.0)
+    search = Search(cost, max_evals, n_iter, target, callback, low.size)
+    k, reach = min(n_members, max_evals), 1 if topology == "ring" else n_members
+    x = first_points(rng, k, x0, low, high)
+    fastest = MAX_STEP * (high - low)
+    v = fastest * (2.0 * rng.random(x.shape) - 1.0)
+    own, own_cost = x.copy(), search.evaluate(x)
+    coefficients, tolerance = np.array([w, c1, c2]), xtol * (high - low)
+    goes_on = search.goes_on(_contracted(x, own, own_cost, tolerance))
+    swarm = (x, v, own, own_cost, coefficients, reach, fastest, low, high, tolerance)
+    if isinstance(cost, CompiledCost):
+        while goes_on:
+            account = search.account()
+            _run(cost.function, cost.data, rng, *swarm, *account)
+            goes_on = search.take(account)
+    while goes_on:
+        k = min(k, search.left)
+        _fly(rng.random((k, low.size, 2)), *swarm[:-1])
+        _keep(x, search.evaluate(x[:k]), own, own_cost)
+        goes_on = search.goes_on(_contracted(x, own, own_cost, tolerance))
+    return search.result()
 
 
-def _stop(cost: float, target: float, x: Array, own: Array, tolerance: Array) -> SwarmStatus | None:
-    if cost <= target:
-        return SwarmStatus.TARGET
-    if np.isfinite(cost) and len(x) > 1 and np.all(np.ptp(np.concatenate([x, own]), axis=0) <= tolerance):
-        return SwarmStatus.CONVERGED
-    return None
+@njit(cache=True, error_model="numpy")
+def _fly(
+    r: Array,
+    x: Array,
+    v: Array,
+    own: Array,
+    own_cost: Array,
+    coefficients: Array,
+    reach: int,
+    fastest: Array,
+    low: Array,
+    high: Array,
+) -> None:
+    """Move the first particles by random numbers r (k, n, 2)."""
+    w, c1, c2 = coefficients
+    best = np.argmin(own_cost)
+    for i in range(len(r)):
+        guide = best if reach > 1 else _best_of_three(own_cost, i)
+        for j in range(low.size):
+            pull = c1 * r[i, j, 0] * (own[i, j] - x[i, j]) + c2 * r[i, j, 1] * (own[guide, j] - x[i, j])
+            speed = min(max(w * v[i, j] + pull, -fastest[j]), fastest[j])
+            there = x[i, j] + speed
+            if there < low[j]:
+                there, speed = 2.0 * low[j] - there, -speed
+            elif there > high[j]:
+                there, speed = 2.0 * high[j] - there, -speed
+            x[i, j], v[i, j] = min(max(there, low[j]), high[j]), speed
 
 
-def _reflect(x: Array, v: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Mirror positions that left the box by at most its width, and turn their velocity."""
-    below, above = x < low, x > high
-    x = np.where(below, 2.0 * low - x, np.where(above, 2.0 * high - x, x))
-    return np.clip(x, low, high), np.where(below | above, -v, v)
+@njit(cache=True, error_model="numpy")
+def _best_of_three(own_cost: Array, i: int) -> int:
+    k = own_cost.size
+    best = i
+    for other in ((i - 1) % k, (i + 1) % k):
+        if own_cost[other] < own_cost[best]:
+            best = other
+    return best
 
 
-def _evaluate(cost: Callable[[Array], Array], points: Array) -> tuple[Array, int]:
-    """Costs (k,) with infinity where they are not finite, and how many of those."""
-    f = np.array(cost(points.copy()), dtype=np.float64)  # both copied: neither side can change the other's
-    if f.shape != (len(points),):
-        raise ValueError(f"cost must return shape ({len(points)},) for points of shape {points.shape}, got {f.shape}")
-    invalid = ~np.isfinite(f)
-    f[invalid] = np.inf
-    return f, int(np.count_nonzero(invalid))
+@njit(cache=True, error_model="numpy")
+def _keep(x: Array, f: Array, own: Array, own_cost: Array) -> None:
+    """Remember points that are better than the particles' own best ones."""
+    for i in range(f.size):
+        if f[i] < own_cost[i]:
+            own_cost[i] = f[i]
+            own[i] = x[i]
 
 
-def _box(bounds: ArrayLike) -> tuple[Array, Array]:
-    b = np.asarray(bounds, dtype=np.float64)
-    if b.ndim != 2 or b.shape[1] != 2 or b.shape[0] == 0:
-        raise ValueError(f"bounds must have shape (n, 2) with n > 0, got {b.shape}")
-    wrong = np.flatnonzero(~((b[:, 0] < b[:, 1]) & (np.abs(b) < LARGEST_BOUND).all(axis=1)))
-    if wrong.size:
-        i = wrong[0]
-        raise ValueError(f"bounds[{i}] must be finite with lower < upper, got {b[i].tolist()}")
-    return b[:, 0], b[:, 1]
+@njit(cache=True, error_model="numpy")
+def _contracted(x: Array, own: Array, own_cost: Array, tolerance: Array) -> bool:
+    """Whether all particles and their best points lie within the tolerance (n,)."""
+    if len(x) < 2 or not np.isfinite(own_cost.min()):
+        return False
+    for j in range(tolerance.size):
+        least = most = x[0, j]
+        for i in range(len(x)):
+            least, most = min(least, x[i, j], own[i, j]), max(most, x[i, j], own[i, j])
+            if most - least > tolerance[j]:
+                return False
+    return True
 
 
-def _first_point(x0: ArrayLike, low: Array, high: Array) -> Array:
-    x = np.asarray(x0, dtype=np.float64)
-    if x.shape != low.shape:
-        raise ValueError(f"x0 must have shape {low.shape} to match bounds, got {x.shape}")
-    outside = np.flatnonzero(~((x >= low) & (x <= high)))
-    if outside.size:
-        i = outside[0]
-        raise ValueError(f"x0[{i}] = {x[i]} lies outside its bounds [{low[i]}, {high[i]}]")
-    return x
-
-
-def _check_options(n_particles: int, max_evals: int, xtol: float, w: float, c1: float, c2: float) -> None:
-    if n_particles < 1:
-        raise ValueError(f"n_particles must be at least 1, got {n_particles}")
-    if max_evals < 1:
-        raise ValueError(f"max_evals must be at least 1, got {max_evals}")
-    if not xtol >= 0:
-        raise ValueError(f"xtol must not be negative, got {xtol}")
-    for name, value in (("w", w), ("c1", c1), ("c2", c2)):
-        if not (np.isfinite(value) and value >= 0):
-            raise ValueError(f"{name} must be finite and not negative, got {value}")
+@compiled_when_called(
+    types.void(
+        *(COST, VECTOR, GENERATOR, MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, types.int64, VECTOR, VECTOR, VECTOR, VECTOR),
+        *ACCOUNT,
+    )
+)
+def _run(
+    function: Any,
+    data: Array,
+    rng: np.random.Generator,
+    x: Array,
+    v: Array,
+    own: Array,
+    own_cost: Array,
+    coefficients: Array,
+    reach: int,
+    fastest: Array,
+    low: Array,
+    high: Array,
+    tolerance: Array,
+    counts: IntArray,
+    best: Array,
+    x_best: Array,
+    history: Array,
+    history_evals: Array,
+    max_evals: int,
+) -> None:
+    """Iterations until the chunk is full or the search ends."""
+    n = low.size
+    probe, goes_on = np.empty(n), True
+    while goes_on:
+        k = min(len(x), max_evals - counts[EVALS])
+        r, f = np.empty((k, n, 2)), np.empty(k)
+        for i in range(k):
+            for j in range(n):
+                r[i, j, 0] = rng.random()
+                r[i, j, 1] = rng.random()
+        _fly(r, x, v, own, own_cost, coefficients, reach, fastest, low, high)
+        for i in range(k):
+            probe[:] = x[i]
+            f[i] = note(function(probe, data), x[i], counts, best, x_best)
+        _keep(x, f, own, own_cost)
+        goes_on = close(counts, best, history, history_evals, max_evals)
+        if _contracted(x, own, own_cost, tolerance):
+            counts[CONVERGED] = 1
+            goes_on = False

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
+
+import numpy as np
 
 from swarm.types import Array
 
@@ -14,6 +16,8 @@ class SwarmStatus(Enum):
     TARGET = "target cost reached"
     CONVERGED = "the population has contracted"
     BUDGET = "evaluations used up"
+    ITERATIONS = "iterations used up"
+    STOPPED = "stopped by the callback"
     NO_FINITE_COST = "no finite cost was met"
 
 
@@ -25,5 +29,6 @@ class SwarmResult:
     cost: float  # infinite where no finite cost was met
     n_evals: int  # points evaluated
     n_invalid: int  # of them without a finite cost
-    history: Array  # (iterations + 1,) best cost after each population
+    history: Array  # (populations,) best cost after each population
     status: SwarmStatus
+    history_evals: Array = field(default_factory=lambda: np.empty(0))  # (populations,) points evaluated by then, where kept

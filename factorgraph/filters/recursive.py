@@ -25,7 +25,7 @@ from factorgraph.assembly.flight import WholeFlight
 from factorgraph.assembly.optimizer import Graph, Result
 from factorgraph.assembly.result import make_solution
 from factorgraph.errors import InputError
-from factorgraph.filters import kalman, updates
+from factorgraph.filters import kalman
 from factorgraph.filters.charts import BODY, Chart
 from factorgraph.filters.clouds import Cloud
 from factorgraph.filters.correctors import Corrector
@@ -272,7 +272,7 @@ def _by_cloud(corrector: Corrector, bend: Array, L: Array | None) -> Update:
     def update(P: Array, e: Array, rows: StageRows, again: Again) -> Updated:
         E = again(bend)
         if L is not None:
-            return updates.rooted_update(L, e, rows.H @ L, E)
+            return corrector.rooted(L, e, rows, E)
         e, H = kalman.whiten(e, rows.H, np.eye(len(e)) + E @ E.T)
         return corrector.update(P, e, replace(rows, H=H), None)
 

@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorgraph.measurements import ImuStream
+from factorgraph.models import magnetic_field
 from factorgraph.problem import ImuNoise, Link, MotionPrior, NavigationProblem, Vehicle
+from factorgraph.types import Array
 from scenarios.flights.navigation import Navigation, builtin_constellation
 from scenarios.flights.schema import Flight
 from scenarios.simulate import fixes, gnss, imu, motion_sensors, ranging, trajectory
@@ -113,10 +115,14 @@ def _vehicle(table: VehicleTable, scenario: Scenario, sky: Sky, streams: Streams
         imu_stream, record.imu[table.name] = imu.simulate(table.imu, known.imu[table.name], streams / "imu", scale)
     if table.gnss is not None:
         antenna, record.gnss[table.name] = gnss.simulate(table.gnss, sky, path, streams / "gnss", scale)
+
+    def field() -> Array:
+        return magnetic_field.field_n(info.origin.frame, info.t0)
+
     moving = (
         [motion_sensors.velocities(s, path, duration, streams / s.name, scale) for s in table.velocities],
         [motion_sensors.attitudes(s, path, duration, streams / s.name, scale) for s in table.attitudes],
-        [motion_sensors.magnetics(s, path, duration, streams / s.name, scale) for s in table.magnetometers],
+        [motion_sensors.magnetics(s, path, duration, streams / s.name, scale, field) for s in table.magnetometers],
     )
     record.sensors.update({f"{table.name}/{s.name}": errors for sensors in moving for s, errors in sensors})
     if isinstance(table.trajectory, Carried):

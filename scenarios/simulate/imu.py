@@ -2,7 +2,8 @@
 
 A density n gives samples of standard deviation n / sqrt(dt) (means over dt). A bias walks by sigma sqrt(dt) per sample, or
 it is a constant plus a Gauss-Markov part of steady standard deviation s and correlation time tau. Estimators are told a
-random walk in both cases, for the latter one of the same driving noise, s sqrt(2 / tau).
+random walk in both cases, for the latter one of the same driving noise, s sqrt(2 / tau), and a first value as uncertain as
+constant and s together.
 Source: spec common.md, section 4.
 """
 
@@ -41,8 +42,12 @@ class ImuTable(Table):
 
     @model_validator(mode="after")
     def _walks_or_returns(self) -> ImuTable:
-        for key, gauss_markov_sigma in (("gyro_gm_deg_h", self.gyro_gm_deg_h), ("accel_gm_mg", self.accel_gm_mg)):
-            walks = [k for k in _walk_keys(key[: key.index("_")]) if getattr(self.noise, k) is not None]
+        parts = (
+            ("gyro_gm_deg_h", self.gyro_gm_deg_h, "gyro_bias_walk_rps_rts"),
+            ("accel_gm_mg", self.accel_gm_mg, "accel_bias_walk_mps2_rts"),
+        )
+        for key, gauss_markov_sigma, walk in parts:
+            walks = [k for k in _keys(walk) if getattr(self.noise, k) is not None]
             if gauss_markov_sigma > 0 and walks:
                 raise InputError(f"{key} and noise.{walks[0]} exclude each other: a bias walks or is Gauss-Markov")
         return self
@@ -57,17 +62,28 @@ class ImuTable(Table):
 
     @property
     def told(self) -> ImuNoiseTable:
-        """Noise as the estimator is told: a Gauss-Markov part counts as the random walk of the same driving noise."""
-        walks: dict[str, float] = {}
+        """Noise as the estimator is told: a Gauss-Markov part counts as the random walk of the same driving noise.
+
+        A first bias that is drawn is as uncertain as its constant and its Gauss-Markov part together; of a given one,
+        the noise table says how well the estimator knows it.
+        """
+        values: dict[str, float | None] = {}
         if self.gyro_gm_rps > 0:
-            walks["gyro_bias_walk_rps_rts"] = self.gyro_gm_rps * math.sqrt(2 / self.gyro_gm_s)
+            values["gyro_bias_walk_rps_rts"] = self.gyro_gm_rps * math.sqrt(2 / self.gyro_gm_s)
+            if self.gyro_bias_rps is None:
+                values |= dict.fromkeys(_keys("gyro_bias_rps"))
+                values["gyro_bias_rps"] = math.hypot(self.noise.noise.gyro_bias_rps, self.gyro_gm_rps)
         if self.accel_gm_mps2 > 0:
-            walks["accel_bias_walk_mps2_rts"] = self.accel_gm_mps2 * math.sqrt(2 / self.accel_gm_s)
-        return self.noise.model_copy(update=walks)
+            values["accel_bias_walk_mps2_rts"] = self.accel_gm_mps2 * math.sqrt(2 / self.accel_gm_s)
+            if self.accel_bias_mps2 is None:
+                values |= dict.fromkeys(_keys("accel_bias_mps2"))
+                values["accel_bias_mps2"] = math.hypot(self.noise.noise.accel_bias_mps2, self.accel_gm_mps2)
+        return self.noise.model_copy(update=values)
 
 
-def _walk_keys(sensor: str) -> list[str]:
-    return [key for key in IMU_NOISE_UNITS if key.startswith(f"{sensor}_bias_walk")]
+def _keys(quantity: str) -> list[str]:
+    """Keys of the noise table that state a quantity, in whatever unit."""
+    return [key for key, (name, _) in IMU_NOISE_UNITS.items() if name == quantity]
 
 
 @dataclass(frozen=True, slots=True)

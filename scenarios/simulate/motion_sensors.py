@@ -6,7 +6,8 @@ C_bs = Exp(m), as in factorgraph.assembly.sensors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -20,7 +21,7 @@ from factorgraph.problem import Vec3
 from factorgraph.types import Array
 from scenarios.flights.schema import NonNegative, Table, TagTable
 from scenarios.simulate.fixes import epochs
-from scenarios.simulate.streams import Name, Streams
+from scenarios.simulate.streams import Name, Streams, gauss_markov
 from scenarios.simulate.trajectory import Trajectory
 
 
@@ -42,18 +43,31 @@ class VelocityTable(Table):
 
 
 class AttitudeTable(Table):
-    """An attitude reference system; `sigma_deg` of the rotation error about east, north and up."""
+    """An attitude reference system; white and Gauss-Markov rotation errors about east, north and up.
+
+    Samples of the latter within its correlation time say the same thing: estimators are told white noise that counts
+    them once, see `told_deg`.
+    """
 
     name: Name = "attitude"
     rate_hz: PositiveFloat = 10.0
     offset_s: NonNegative = 0.0
-    sigma_deg: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (0.5, 0.5, 1.0)
+    sigma_deg: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (0.5, 0.5, 1.0)  # white
+    gm_deg: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)  # steady standard deviations
+    gm_s: PositiveFloat = 5.0  # correlation time
     tells: Literal["all", "tilt", "heading"] = "all"
     mounting_sigma_deg: NonNegative = 0.0
 
     @property
     def calibration(self) -> Calibration:
         return Calibration(mounting_rad=np.deg2rad(self.mounting_sigma_deg))
+
+    @property
+    def told_deg(self) -> tuple[float, float, float]:
+        """White noise that averages as the errors do: 2 tau rate samples of the Gauss-Markov part count once."""
+        once = np.sqrt(max(1.0, 2 * self.gm_s * self.rate_hz))
+        east, north, up = np.hypot(self.sigma_deg, once * np.array(self.gm_deg)).tolist()
+        return east, north, up
 
 
 class MagnetometerTable(Table):
@@ -62,7 +76,7 @@ class MagnetometerTable(Table):
     name: Name = "magnetometer"
     rate_hz: PositiveFloat = 10.0
     offset_s: NonNegative = 0.0
-    field_n: Vec3 = (0.9, 19.1, -45.3)  # microtesla, east-north-up
+    field_n: Vec3 | Literal["model"] = (0.9, 19.1, -45.3)  # microtesla, east-north-up; "model": of the place and date
     sigma: PositiveFloat = 0.5
     bias_sigma: NonNegative = 0.0
     mounting_sigma_deg: NonNegative = 0.0
@@ -103,11 +117,12 @@ class VisionTable(Table):
 
 @dataclass(frozen=True, slots=True)
 class SensorRecord:
-    """The constant errors put into a sensor."""
+    """The errors put into a sensor: constant ones, and those of attitudes."""
 
     scale: float = 0.0
     mounting_rad: Array = field(default_factory=lambda: np.zeros(3))
     bias: Array = field(default_factory=lambda: np.zeros(3))
+    rotation_n: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) of attitudes, sample by sample [rad]
 
     @property
     def C_bs(self) -> Array:
@@ -143,22 +158,33 @@ def attitudes(
     """Attitudes of the whole flight."""
     record = _drawn(table.calibration, streams, noise_scale)
     t = epochs(table.rate_hz, table.offset_s, duration_s)
-    sigma = np.deg2rad(table.sigma_deg)
-    error = exp_so3(streams("noise").normal(0.0, 1.0, (len(t), 3)) * sigma * noise_scale)
-    q = quat_from_matrix(error @ trajectory.at(t).C_nb @ record.C_bs)
+    rotation = streams("noise").normal(0.0, 1.0, (len(t), 3)) * np.deg2rad(table.sigma_deg)
+    if max(table.gm_deg) > 0:
+        drift = gauss_markov(streams("gauss-markov").normal(0.0, 1.0, (len(t), 3)), 1 / (table.rate_hz * table.gm_s))
+        rotation += drift * np.deg2rad(table.gm_deg)
+    rotation *= noise_scale
+    q = quat_from_matrix(exp_so3(rotation) @ trajectory.at(t).C_nb @ record.C_bs)
+    sigma = np.deg2rad(table.told_deg)
     told = np.where({"all": [0, 0, 0], "tilt": [0, 0, 1], "heading": [1, 1, 0]}[table.tells], np.inf, sigma)
-    return AttitudeStream(t, q, np.tile(told, (len(t), 1)), table.name, table.calibration), record
+    stream = AttitudeStream(t, q, np.tile(told, (len(t), 1)), table.name, table.calibration)
+    return stream, replace(record, rotation_n=rotation)
 
 
 def magnetics(
-    table: MagnetometerTable, trajectory: Trajectory, duration_s: float, streams: Streams, noise_scale: float
+    table: MagnetometerTable,
+    trajectory: Trajectory,
+    duration_s: float,
+    streams: Streams,
+    noise_scale: float,
+    model_n: Callable[[], Array],
 ) -> tuple[MagneticStream, SensorRecord]:
-    """Fields of the whole flight."""
+    """Fields of the whole flight; model_n gives the field (3,) of the place and date to tables that ask for it."""
     record = _drawn(table.calibration, streams, noise_scale)
     t = epochs(table.rate_hz, table.offset_s, duration_s)
-    m_b = np.einsum("nji,j->ni", trajectory.at(t).C_nb, np.array(table.field_n))
+    east, north, up = model_n().tolist() if table.field_n == "model" else table.field_n
+    m_b = np.einsum("nji,j->ni", trajectory.at(t).C_nb, np.array([east, north, up]))
     z = m_b @ record.C_bs + record.bias + streams("noise").normal(0.0, table.sigma, m_b.shape) * noise_scale
-    return MagneticStream(t, z, np.full(z.shape, table.sigma), table.field_n, table.name, table.calibration), record
+    return MagneticStream(t, z, np.full(z.shape, table.sigma), (east, north, up), table.name, table.calibration), record
 
 
 def vision(

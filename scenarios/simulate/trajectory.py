@@ -92,8 +92,29 @@ class OffsetAt(Table):
     offset_m: Vec3
 
 
+class Wave(Table):
+    """A sine about the offset, sin(2 pi t / period + phase)."""
+
+    size_m: Vec3  # amplitudes
+    period_s: PositiveFloat
+    phase_deg: float = 0.0
+
+
+class Push(Table):
+    """A constant acceleration away from the place in the formation, and smoothly back to it within `back_s`."""
+
+    t_s: float
+    duration_s: PositiveFloat
+    accel_mps2: Vec3
+    back_s: PositiveFloat = 25.0
+    blend_s: float = Field(default=0.6, ge=4 * NODE_S)
+
+
 class Formation(Table):
-    """At an offset (right, front, up) from another vehicle, constant or moving between `offsets` in straight, blended legs."""
+    """At an offset (right, front, up) from another vehicle, constant or moving between `offsets` in straight, blended legs.
+
+    Waves and pushes, in the same axes, come on top of it.
+    """
 
     kind: Literal["formation"]
     leader: str
@@ -101,6 +122,8 @@ class Formation(Table):
     offset_m: Vec3 | None = None
     offsets: tuple[OffsetAt, ...] = ()
     blend_s: float = Field(default=6.0, ge=4 * NODE_S)
+    waves: tuple[Wave, ...] = ()
+    pushes: tuple[Push, ...] = ()
     attitude: Follow = "coordinated"
     sway_m: float = Field(default=0.0, ge=0)
     sway_s: PositiveFloat = 30.0
@@ -480,9 +503,25 @@ def _following(name: str, table: Formation, nodes: Array, rng: np.random.Generat
         at = np.array([o.offset_m for o in table.offsets])
         offset = np.column_stack([_blended(np.interp(nodes, t, axis), table.blend_s) for axis in at.T])
     offset = offset + _sway(table.sway_m, table.sway_s, nodes, rng)
+    for wave in table.waves:
+        phase = 2 * np.pi * nodes / wave.period_s + np.deg2rad(wave.phase_deg)
+        offset = offset + np.sin(phase)[:, None] * wave.size_m
+    for push in table.pushes:
+        offset = offset + _pushed(push, nodes)[:, None] * push.accel_mps2
     motion = leader.at(nodes)
     C = motion.C_nb
     if table.frame == "track":
         heading = leader.euler(nodes)[:, 2]
         C = matrix_from_euler(np.zeros(len(nodes)), np.zeros(len(nodes)), heading)
     return np.asarray(motion.r_n + np.einsum("nij,nj->ni", C, offset))
+
+
+def _pushed(push: Push, nodes: Array) -> Array:
+    """Way (n,) under a push of unit acceleration: t^2 / 2, then the quintic that ends at rest where the push began."""
+    duration, back = push.duration_s, push.back_s
+    gone, t = np.array([duration**2 / 2, duration * back, 0.0]), nodes - push.t_s  # way and speed, in times of `back`
+    ends = np.array([[1.0, 1.0, 1.0], [3.0, 4.0, 5.0], [6.0, 12.0, 20.0]])  # of u^3, u^4, u^5 and their derivatives at 1
+    high = np.linalg.solve(ends, -np.array([gone[0] + gone[1], gone[1], 0.0]))
+    u = np.clip((t - duration) / back, 0.0, 1.0)
+    way = np.where(t < duration, np.clip(t, 0.0, duration) ** 2 / 2, np.polyval([*high[::-1], *gone[::-1]], u))
+    return _blended(way, push.blend_s)

@@ -177,7 +177,7 @@ def _attitudes(name: str, stream: AttitudeStream, table: AttitudeTable, folder: 
         name=stream.name,
         time=TIME,
         quaternion=QUATERNION,
-        sigma_deg=table.sigma_deg,
+        sigma_deg=table.told_deg,
         tells=table.tells,
         mounting_sigma_deg=table.mounting_sigma_deg,
     )
@@ -189,7 +189,7 @@ def _magnetics(name: str, stream: MagneticStream, table: MagnetometerTable, fold
         name=stream.name,
         time=TIME,
         field=FIELD,
-        field_m=table.field_n,
+        field_m=stream.field_n,
         sigma=table.sigma,
         bias_sigma=table.bias_sigma,
         mounting_sigma_deg=table.mounting_sigma_deg,

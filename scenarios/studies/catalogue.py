@@ -17,6 +17,16 @@ STUDIES = Names(
             "two-stage relative navigation for aerial refuelling, after Wu and others (2022)",
         ),
         Named(
+            "ahrs-tdo",
+            "scenarios.studies.ahrs_tdo:STUDY",
+            "relative navigation with attitude systems, UWB and Tasmanian devil optimisation, after Lu and others (2024)",
+        ),
+        Named(
+            "optimisers",
+            "scenarios.studies.optimisers:STUDY",
+            "swarm optimisers on test functions and on navigation, at equal evaluations",
+        ),
+        Named(
             "stress",
             "scenarios.studies.stress:STUDY",
             "the factor graph under outliers, slips, wrong installations, unknown headings and long baselines",

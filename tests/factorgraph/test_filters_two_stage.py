@@ -70,7 +70,8 @@ def true_track(flight: SimulatedFlight, name: str = TANKER) -> TightTrack:
     at = path.at(t)
     place, speed = at.point(vehicle.gnss.lever_b)
     n, zero = len(t), np.zeros((len(t), 6, 6))
-    return TightTrack(t, at.r_n, at.v_n, at.C_nb, np.zeros((n, 9, 9)), zero, place, speed, np.zeros(n), np.zeros(n))
+    rest = (np.zeros(n), np.zeros(n), np.zeros((n, 9)), np.zeros((n, 2)), np.zeros((n, 20, 20)))
+    return TightTrack(t, at.r_n, at.v_n, at.C_nb, np.zeros((n, 9, 9)), zero, place, speed, *rest)
 
 
 def shared(flight: SimulatedFlight, start: dict[str, InertialStart] | None = None, **kwargs: Any) -> Shared:

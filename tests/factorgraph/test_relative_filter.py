@@ -16,14 +16,14 @@ from factorgraph.attitude import skew
 from factorgraph.consistency import nees
 from factorgraph.errors import InputError
 from factorgraph.filters.relative import filtering, motion, rows
-from factorgraph.filters.relative.motion import AccelModel, AttitudeReferenced, Mover, Smooth, error, position, velocity
+from factorgraph.filters.relative.motion import AccelModel, AttitudeReferenced, Mover, Smooth, error, position, tilt, velocity
 from factorgraph.geodesy import LocalFrame
 from factorgraph.types import Array
 from scenarios.simulate import load_scenario
 from scenarios.simulate.flight import Exact, exact
 from tests.helpers import numerical_jacobian
 
-MODEL = AccelModel(5e-4, 0.01, 3600.0, (6e-3, 6e-3, 16e-3))
+MODEL = AccelModel(5e-4, 0.01, 3600.0, (2e-3, 2e-3, 5e-3), 5.0)
 UAVS = ("leader", "follower")
 
 
@@ -76,13 +76,30 @@ def test_without_coriolis_and_gravity_difference_dead_reckoning_does_not_close(f
     assert np.linalg.norm(off) > 2e-3
 
 
-def test_check_1_transition_is_the_derivative(flown: tuple[Exact, LocalFrame]) -> None:
+@pytest.mark.parametrize("coloured", [False, True])
+def test_check_1_transition_is_the_derivative(flown: tuple[Exact, LocalFrame], coloured: bool) -> None:
     t = np.arange(5.0, 8.5, 0.5)
     place, v, r = relative_truth(flown, t)
-    moving = AttitudeReferenced(movers(flown), t, place)
-    x = np.concatenate([v[2], r[2], 0.01 * np.arange(6.0)])
-    J = numerical_jacobian(lambda d: moving.predict(3, x + d)[0], 12, 1.0)
+    moving = AttitudeReferenced(movers(flown), t, place, coloured)
+    x = np.concatenate([v[2], r[2], 0.01 * np.arange(12.0 if coloured else 6.0)])
+    J = numerical_jacobian(lambda d: moving.predict(3, x + d)[0], len(x), 1.0)
     np.testing.assert_allclose(moving.predict(3, x)[1], J, atol=1e-6)
+
+
+def test_coloured_attitude_errors_push_as_wrong_attitudes_do(flown: tuple[Exact, LocalFrame]) -> None:
+    t = np.arange(5.0, 7.5, 1.0)
+    place, v, r = relative_truth(flown, t)
+    leader, follower = movers(flown)
+    psi = np.array([1e-3, -2e-3, 5e-4])  # of the truth against what is told
+    told = replace(follower, f_e=follower.f_e - np.cross(psi, follower.f_e), model=replace(MODEL, attitude_s=1e9))
+    moving = AttitudeReferenced([leader, told], t, place, coloured=True)
+    x = np.zeros(moving.size)
+    x[velocity(0)], x[position(0)], x[tilt(1, 1)] = v[0], r[0], psi
+    for k in (1, 2):
+        x = moving.predict(k, x)[0]
+    assert np.linalg.norm(x[velocity(0)] - v[2]) < 1e-3
+    x[velocity(0)] -= v[2]
+    assert np.linalg.norm(moving.predict(1, np.concatenate([v[0], r[0], np.zeros(12)]))[0][velocity(0)] - v[1]) > 5e-3
 
 
 def test_check_2_identity_in_the_position_block_as_printed_runs_away() -> None:
@@ -105,10 +122,12 @@ def test_check_3_attitude_noise_moves_velocity_and_not_position(flown: tuple[Exa
     )
     Q = moving.predict(1, np.zeros(12))[2]
     f = follower.f_e[100]
-    S = follower.C_en.T @ np.diag(np.square(silent.attitude_rad_rthz)) @ follower.C_en
+    S = follower.C_en.T @ np.diag(2 * silent.attitude_s * np.square(silent.attitude_rad)) @ follower.C_en
     np.testing.assert_allclose(Q[:3, :3], dt * skew(f) @ S @ skew(f).T, rtol=1e-9, atol=1e-18)
     assert np.trace(Q[3:6, 3:6]) < dt**2 * np.trace(Q[:3, :3])
     assert not np.any(Q[6:, :])
+    coloured = AttitudeReferenced(moving.movers, t, np.zeros((2, 3)) + 6.4e6, coloured=True)
+    assert not np.any(coloured.predict(1, np.zeros(18))[2][:12, :12])  # then the error is a state and not noise
 
 
 def test_signs_of_the_accelerometer_errors(flown: tuple[Exact, LocalFrame]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorgraph.attitude import euler_from_matrix, matrix_from_quat
+from factorgraph.attitude import euler_from_matrix, log_so3, matrix_from_quat
 from factorgraph.errors import InputError
 from factorgraph.measurements import Calibration
 from factorgraph.problem import Constraints, ImuCalibration
@@ -145,6 +145,38 @@ def sensors_flight(folder: Path, table: str, rows: Array, header: str = "t,a,b,c
     flight_files.write_flight(folder, flight_files.FLIGHT + table)
     flight_files.write_csv(folder / "more.csv", header, rows)
     return folder
+
+
+def test_attitude_errors_persist_and_are_told_as_noise_that_counts_them_once(tmp_path: Path) -> None:
+    """Gauss-Markov part of the stated size and correlation time, recorded sample by sample; the folder tells the same."""
+    table = "{ rate_hz = 50.0, sigma_deg = [0.02, 0.02, 0.04], gm_deg = [0.5, 0.5, 1.5], gm_s = 0.4 }"
+    head = ALL[: ALL.index("imu =")].replace("duration_s = 20.0\n\n", "duration_s = 1000.0\n\n")
+    text = head.replace("duration_s = 20.0, turn", "duration_s = 1000.0, turn") + f"attitudes = [{table}]\n"
+    flight = simulate(parse(text + "positions = [{}]\n"), 4)
+    (stream,), record = flight.problem.vehicle("car").attitudes, flight.record.sensors["car/attitude"]
+    true = flight.record.trajectories["car"].at(stream.t_s).C_nb
+    error = log_so3(matrix_from_quat(stream.q_nb) @ np.swapaxes(true, 1, 2))
+    np.testing.assert_allclose(error, record.rotation_n, atol=1e-12)
+    np.testing.assert_allclose(np.rad2deg(error.std(axis=0)), (0.5, 0.5, 1.5), rtol=0.1)
+    late = np.mean(error[20:] * error[:-20], axis=0) / np.var(error, axis=0)
+    np.testing.assert_allclose(late, np.exp(-1.0), atol=0.1)
+    told = np.hypot((0.02, 0.02, 0.04), np.sqrt(40.0) * np.array((0.5, 0.5, 1.5)))
+    np.testing.assert_allclose(np.rad2deg(stream.sigma_rad), np.tile(told, (len(stream.t_s), 1)))
+    back = load(write_flight(flight, tmp_path)).problem.vehicle("car").attitudes[0]
+    np.testing.assert_allclose(back.sigma_rad, stream.sigma_rad)
+
+
+def test_a_magnetometer_may_measure_the_model_of_place_and_date(tmp_path: Path) -> None:
+    """Bavaria in June 2024: 4.1 deg east of north, 64 deg down, 48.7 microtesla."""
+    text = ALL[: ALL.index("imu =")] + 'magnetometers = [{ field_n = "model" }]\npositions = [{}]\n'
+    flight = simulate(parse(text), 4)
+    stream = flight.problem.vehicle("car").magnetics[0]
+    east, north, up = stream.field_n
+    assert np.rad2deg(np.arctan2(east, north)) == pytest.approx(4.1, abs=0.2)
+    assert np.rad2deg(np.arctan2(-up, np.hypot(east, north))) == pytest.approx(64.0, abs=0.5)
+    assert np.linalg.norm(stream.field_n) == pytest.approx(48.7, abs=0.3)
+    back = load(write_flight(flight, tmp_path)).problem.vehicle("car").magnetics[0]
+    np.testing.assert_allclose(back.field_n, stream.field_n)
 
 
 def test_an_odometer_in_kilometres_per_hour_and_one_in_distances(tmp_path: Path) -> None:

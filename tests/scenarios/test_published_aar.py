@@ -76,7 +76,7 @@ def test_what_is_simulated_is_what_was_published(flight: aar.AarFlight) -> None:
         assert stream.signals == ("C2I",) and stream.klobuchar is None
         assert np.rad2deg(flight.record.gnss[vehicle.name].elevation_rad.min()) >= 25.0
         assert np.max(np.abs(flight.record.gnss[vehicle.name].clock_s)) < 1e-6
-        np.testing.assert_allclose((noise.gyro_bias_rps, noise.accel_bias_mps2), (deg_h, 0.3 * mg))
+        np.testing.assert_allclose((noise.gyro_bias_rps, noise.accel_bias_mps2), (np.hypot(1.0, 0.01) * deg_h, 0.3 * mg))
         np.testing.assert_allclose(noise.gyro_bias_walk_rps_rts, 0.01 * deg_h * np.sqrt(2 / 1500))
         np.testing.assert_allclose(noise.accel_bias_walk_mps2_rts, 0.3 * mg * np.sqrt(2 / 4000))
         record = flight.record.imu[vehicle.name]

@@ -100,11 +100,22 @@ def test_gauss_markov_biases_have_their_size_and_correlation() -> None:
 def test_a_gauss_markov_bias_is_told_as_the_walk_of_its_driving_noise() -> None:
     told = imu.ImuTable(noise=BIASED, gyro_gm_deg_h=3.0, gyro_gm_s=200.0).told.noise
     np.testing.assert_allclose(told.gyro_bias_walk_rps_rts, np.sqrt(2 * (3.0 / 3600 * np.pi / 180) ** 2 / 200.0), rtol=1e-12)
-    np.testing.assert_allclose(told.gyro_bias_rps, 5.0 / 3600 * np.pi / 180, rtol=1e-12)
+    np.testing.assert_allclose(told.gyro_bias_rps, np.hypot(5.0, 3.0) / 3600 * np.pi / 180, rtol=1e-12)
     assert told.accel_bias_walk_mps2_rts == BIASED.noise.accel_bias_walk_mps2_rts
     walking = BIASED.model_copy(update={"gyro_bias_walk_deg_h_rts": 1.0})
     with pytest.raises(ValidationError, match=r"gyro_gm_deg_h and noise.gyro_bias_walk_deg_h_rts exclude each other"):
         imu.ImuTable(noise=walking, gyro_gm_deg_h=3.0)
+
+
+def test_a_drawn_bias_is_told_with_its_gauss_markov_part() -> None:
+    """Constant and varying part together where the start is drawn; as declared where it is given."""
+    noise = ImuNoiseTable(gyro_bias_deg_h=3.0, accel_bias_mg=4.0)
+    told = imu.ImuTable(noise=noise, gyro_gm_deg_h=4.0, accel_gm_mg=3.0).told.noise
+    np.testing.assert_allclose((told.gyro_bias_rps, told.accel_bias_mps2), (np.deg2rad(5.0 / 3600), 5e-3 * 9.80665))
+    given = imu.ImuTable(noise=noise, gyro_gm_deg_h=4.0, accel_gm_mg=3.0, accel_bias_mps2=(0.0, 0.0, 0.0)).told.noise
+    assert given.accel_bias_mps2 == pytest.approx(4e-3 * 9.80665) and given.gyro_bias_rps == told.gyro_bias_rps
+    still = imu.ImuTable(noise=noise).told
+    assert still == noise
 
 
 def test_scale_factors_multiply_the_motion() -> None:

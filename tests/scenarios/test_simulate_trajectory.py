@@ -15,12 +15,14 @@ from scenarios.simulate.trajectory import (
     KinematicTrajectory,
     Manoeuvres,
     OffsetAt,
+    Push,
     Rates,
     Segment,
     SplineTrajectory,
     Static,
     Trajectory,
     TrajectoryTable,
+    Wave,
     Waypoint,
     Waypoints,
     build,
@@ -109,6 +111,34 @@ def test_a_follower_holds_its_offsets_in_the_track_frame() -> None:
         right, front = np.array([np.cos(psi), -np.sin(psi), 0.0]), np.array([np.sin(psi), np.cos(psi), 0.0])
         d = (follower.r_n - leader.r_n)[0]
         np.testing.assert_allclose((d @ right, d @ front, d[2]), offset.offset_m, atol=1e-3)
+
+
+def test_a_follower_swings_and_is_pushed_aside_and_comes_back() -> None:
+    """Waves are sines about the offset; a push is its acceleration for its time, then a smooth way back, at rest there."""
+    straight = Manoeuvres(kind="manoeuvres", speed_mps=30.0, heading_deg=30.0, segments=(Segment(duration_s=90.0),))
+    wave = Wave(size_m=(0.0, 1.0, 4.0), period_s=20.0, phase_deg=90.0)
+    push = Push(t_s=40.0, duration_s=3.0, accel_mps2=(2.0, 0.0, 0.0), back_s=25.0)
+    paths = built(
+        leader=straight,
+        swings=Formation(kind="formation", leader="leader", offset_m=(10.0, -30.0, 5.0), waves=(wave,)),
+        pushed=Formation(kind="formation", leader="leader", offset_m=(10.0, -30.0, 5.0), pushes=(push,)),
+    )
+    t = np.arange(0.0, 90.01, 0.05)
+    C = np.array([[np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0], [-np.sin(np.pi / 6), np.cos(np.pi / 6), 0.0], [0.0, 0.0, 1.0]])
+    swings, pushed = (
+        (paths[name].at(t).r_n - paths["leader"].at(t).r_n) @ C - [10.0, -30.0, 5.0] for name in ("swings", "pushed")
+    )
+    np.testing.assert_allclose(swings, np.cos(2 * np.pi * t / 20.0)[:, None] * [0.0, 1.0, 4.0], atol=1e-4)
+    assert np.max(np.abs(pushed[:, 1:])) < 1e-6
+    way, speed = pushed[:, 0], np.gradient(pushed[:, 0], t)
+    accel = np.gradient(speed, t)
+    away = (t < 39.5) | (t > 68.5)
+    assert np.max(np.abs(way[away])) < 1e-6
+    np.testing.assert_allclose(accel[(t > 40.5) & (t < 42.5)], 2.0, atol=0.02)
+    assert way[t.searchsorted(43.0)] == pytest.approx(9.0, abs=0.1) and speed[t.searchsorted(43.3)] == pytest.approx(6.0, abs=0.2)
+    assert way.min() > -0.5 and way.max() < 40.0 and np.max(np.abs(accel)) < 2.5
+    _, roll, _ = euler_from_matrix(paths["pushed"].at(np.array([41.5])).C_nb)
+    assert float(np.tan(roll[0])) == pytest.approx(2.0 / STANDARD_GRAVITY, rel=0.02)
 
 
 def test_waypoints_are_passed_at_their_times() -> None:

@@ -64,10 +64,10 @@ def test_beats_random_search_at_the_same_budget() -> None:
 
 
 @pytest.mark.parametrize("max_evals", [1, 7, 30, 31, 100, 1000])
-@pytest.mark.parametrize("n_particles", [1, 8, 30])
-def test_budget_is_never_exceeded_and_truly_counted(max_evals: int, n_particles: int) -> None:
+@pytest.mark.parametrize("n_members", [1, 8, 30])
+def test_budget_is_never_exceeded_and_truly_counted(max_evals: int, n_members: int) -> None:
     cost = Recorder(rastrigin)
-    result = pso.minimize(cost, box(3), rng=np.random.default_rng(1), n_particles=n_particles, max_evals=max_evals)
+    result = pso.minimize(cost, box(3), rng=np.random.default_rng(1), n_members=n_members, max_evals=max_evals)
     assert result.n_evals == len(cost.points) == max_evals
     assert result.status is SwarmStatus.BUDGET
     assert len(result.history) == len(cost.calls)
@@ -158,7 +158,7 @@ def test_cost_cannot_disturb_the_swarm() -> None:
         ({"bounds": [[-np.inf, 0]]}, r"bounds\[0\]"),
         ({"bounds": [0, 1]}, r"shape \(n, 2\)"),
         ({"bounds": np.zeros((0, 2))}, r"n > 0"),
-        ({"n_particles": 0}, "n_particles must be at least 1, got 0"),
+        ({"n_members": 0}, "n_members must be at least 1, got 0"),
         ({"max_evals": 0}, "max_evals must be at least 1, got 0"),
         ({"x0": [0.5]}, r"x0 must have shape \(2,\)"),
         ({"x0": [0.5, 1.5]}, r"x0\[1\] = 1.5 lies outside its bounds \[0.0, 1.0\]"),

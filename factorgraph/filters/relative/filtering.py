@@ -4,24 +4,35 @@
     5 judge, 6 accept, 7 correct                          a `Correct` sees prior, posterior and rows, and may replace the state
 
 The corrector is any callable; the judgement rule and the swarm optimisers of Lu et al. (2024) are one. A strong tracking factor
-on what the transition brings is the control that needs neither.
+on what the transition brings is the control that needs neither. Where ranges alone place vehicles a few metres apart, distances
+bend within the prior's covariance: an iterated update linearises them again where it leads, a cubature update sees them through
+points. Losses weigh ranges and heights by their standardised innovations; double differences are correlated and are not weighed.
 
 Source: Lu et al. (2024), section 3.5; spec ahrs_tdo.md, sections 2.7 and 2.8.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
-from factorgraph.filters import kalman
+from factorgraph.filters import kalman, updates
 from factorgraph.filters.adaptive import Fading
 from factorgraph.filters.relative.motion import Motion, position, velocity
-from factorgraph.filters.relative.rows import Rows, Source, stacked
+from factorgraph.filters.relative.rows import KINDS, Rows, Source, stacked
+from factorgraph.filters.sigma_points import cubature
+from factorgraph.models.robust import Loss
+from factorgraph.models.robust import weight as robust_weight
 from factorgraph.types import Array, BoolArray, IntArray
+
+Form = Literal["linear", "iterated", "cubature"]
+WEIGHED = ("range", "height")  # kinds whose rows are independent
+LEAST = 1e-6  # weight
+SHOWS = 0.1  # of the noise: second order that an update is iterated for
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +95,10 @@ class Options:
     """How updates are made."""
 
     correct: Correct | None = None
+    update: Form = "linear"
+    losses: Mapping[str, Loss] = field(default_factory=dict)  # by kind of measurement
     strong_tracking: bool = False
+    constants: tuple[float, ...] = ()  # standard deviations of constants behind the states: scales and biases of ranges
     observe: Callable[[int, Update], None] | None = None  # sees every update
 
 
@@ -96,17 +110,20 @@ def run(
     start: followers' velocities and positions (6 M,) at the first epoch, v_1 r_1 v_2 .., with their covariance (6 M, 6 M).
     """
     options = options or Options()
-    n, m = motion.size, 6 * motion.n_followers
+    moving, m = motion.size, 6 * motion.n_followers
+    n = moving + len(options.constants)
     x, P = np.zeros(n), np.zeros((n, n))
-    x[:m], P[:m, :m], P[m:, m:] = start[0], start[1], motion.start()
+    x[:m], P[:m, :m], P[m:moving, m:moving] = start[0], start[1], motion.start()
+    P[moving:, moving:] = np.diag(np.square(options.constants))
     K, fading = len(t_s), Fading()
     states, covariances = np.zeros((K, n)), np.zeros((K, n, n))
     nis_of, statistic, threshold = np.full((3, K), np.nan)
     n_rows, triggered = np.zeros(K, np.int64), np.zeros(K, bool)
     Phi, Q = np.eye(n), np.zeros((n, n))
     for k in range(K):
+        x = x.copy()
         if k:
-            x, Phi, Q = motion.predict(k, x)
+            x[:moving], Phi[:moving, :moving], Q[:moving, :moving] = motion.predict(k, x[:moving])
         parts = [rows for source in sources if (rows := source.rows(k, x)) is not None]
         moved = P if k == 0 else kalman.predict(P, Phi, np.zeros((n, n)))
         if not parts:
@@ -114,11 +131,12 @@ def run(
         else:
             rows = stacked(parts)
             nu, H = rows.linearised(x)
+            rows = _weighed(rows, nu, H, moved + Q if k else P, options.losses)
             if options.strong_tracking and k:
                 factor, fading = _fading(fading, moved, Q, nu, H, rows.R)
                 moved = factor * moved
             prior = moved + Q if k else P
-            dx, P_post, nis = kalman.update_sequential(prior, nu, H, rows.R)
+            dx, P_post, nis = _corrected(options.update, prior, x, rows, nu, H)
             update = Update(x, prior, x + dx, P_post, rows, H)
             if options.observe is not None:
                 options.observe(k, update)
@@ -129,6 +147,53 @@ def run(
                 triggered[k], statistic[k], threshold[k] = made.triggered, made.statistic, made.threshold
         states[k], covariances[k] = x, P
     return RelativeTrack(t_s, states, covariances, motion.n_followers, nis_of, n_rows, triggered, statistic, threshold)
+
+
+def _weighed(rows: Rows, nu: Array, H: Array, P: Array, losses: Mapping[str, Loss]) -> Rows:
+    """Rows of ranges and heights with the variance that their innovations ask for."""
+    told = [name for name in WEIGHED if name in losses and np.any(rows.kind == KINDS.index(name))]
+    if not told:
+        return rows
+    R = rows.R.copy()
+    for name in told:
+        mine = np.flatnonzero(rows.kind == KINDS.index(name))
+        variance = np.einsum("mi,ij,mj->m", H[mine], P, H[mine]) + R[mine, mine]
+        R[mine, mine] /= np.maximum(robust_weight(losses[name], nu[mine] / np.sqrt(variance)), LEAST)
+    return replace(rows, R=R)
+
+
+def _bends(P: Array, x: Array, rows: Rows) -> bool:
+    """Whether a distance's second order, the variance across it over twice its length, shows beside its noise."""
+    if not len(rows.norm_rows):
+        return False
+    size = np.linalg.norm(rows.norm_D @ x + rows.norm_d, axis=1)
+    spread = np.einsum("qan,nm,qam->q", rows.norm_D, P, rows.norm_D, optimize=True)
+    noise = np.sqrt(np.diag(rows.R)[rows.norm_rows])
+    return bool(np.any(spread > 2.0 * SHOWS * noise * size))
+
+
+def _corrected(form: Form, P: Array, x: Array, rows: Rows, nu: Array, H: Array) -> tuple[Array, Array, float]:
+    """Correction (n,), posterior covariance (n, n) and normalised innovation squared."""
+    if form == "linear" or not _bends(P, x, rows):
+        dx, posterior, nis = kalman.update_sequential(P, nu, H, rows.R)
+        return dx, posterior, nis
+    L = np.linalg.cholesky(rows.R)
+    free = np.flatnonzero(np.diag(P) > 0.0)  # a reference that stands still has no errors
+
+    def linearise(d: Array) -> tuple[Array, Array]:
+        at = x.copy()
+        at[free] += d
+        at_nu, at_H = rows.linearised(at)
+        return solve_triangular(L, at_nu, lower=True), solve_triangular(L, at_H[:, free], lower=True)
+
+    def residuals(D: Array) -> Array:
+        return np.array([linearise(d)[0] for d in D])
+
+    own = P[np.ix_(free, free)]
+    u = updates.iterated(own, linearise) if form == "iterated" else updates.sigma_point(own, residuals, cubature(len(free)))
+    dx, posterior = np.zeros(len(x)), np.zeros_like(P)
+    dx[free], posterior[np.ix_(free, free)] = u.dx, u.P
+    return dx, posterior, u.nis
 
 
 def _fading(state: Fading, moved: Array, Q: Array, nu: Array, H: Array, R: Array) -> tuple[float, Fading]:

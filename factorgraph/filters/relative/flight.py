@@ -6,7 +6,8 @@
 
 The reference is that of the first link. Without links it is the first vehicle; where anchors are heard, the ground at the origin
 of n: every vehicle is then a follower of it, and pairs are differences of followers. What the filter is told is the problem's:
-noise of receivers, IMUs and ranges. A range's bias and scale are not estimated, as in the source.
+noise of receivers, IMUs and ranges. Scales and biases that the problem lets ranges have are constants of the filter where asked
+(`Configuration.calibrate_ranges`); the source estimates neither.
 
 `prepare` does what all configurations share, `Formation.run` filters. Source: Lu et al. (2024); spec ahrs_tdo.md, sections 1,
 2.7 and 2.8.
@@ -23,7 +24,7 @@ import numpy as np
 from factorgraph.attitude import matrix_from_quat
 from factorgraph.errors import InputError, positive
 from factorgraph.filters.relative import filtering
-from factorgraph.filters.relative.filtering import Correct, Options, RelativeTrack, Update
+from factorgraph.filters.relative.filtering import Correct, Form, Options, RelativeTrack, Update
 from factorgraph.filters.relative.motion import (
     PERFECT,
     AccelModel,
@@ -49,8 +50,10 @@ from factorgraph.filters.relative.rows import (
     arms,
     nearest_epoch,
 )
+from factorgraph.filters.relative.start import placed, rest_until
 from factorgraph.geodesy import LocalFrame
 from factorgraph.grid import subdivided
+from factorgraph.measurements import Tag
 from factorgraph.models.double_differences import PairEpochs, pair_epochs
 from factorgraph.models.receivers import Receiver
 from factorgraph.problem import NavigationProblem, RangeModel, Vehicle
@@ -89,10 +92,14 @@ class Configuration:
 
     motion: Literal["attitude", "velocity", "acceleration"] = "attitude"
     walk: float = 1.0  # of constant velocity [m/s per sqrt(s)] or acceleration [m/s^2 per sqrt(s)]
+    coloured: bool = False  # attitude errors are states with a correlation time, not white noise
     kinds: tuple[str, ...] = KINDS  # measurements used
     absolute_factor: float = 4.0  # on the covariance of absolute differences, which share their code with double differences
     range_scale: float = 1.0  # of the crystal, where it is known
+    calibrate_ranges: bool = False  # estimate the scales and biases that the problem says ranges may have
     strong_tracking: bool = False
+    update: Form = "linear"
+    robust: bool = False  # ranges and heights weighed with the problem's losses
 
     def __post_init__(self) -> None:
         positive(self, "walk", "absolute_factor", "range_scale")
@@ -109,13 +116,14 @@ class Formation:
     names: tuple[str, ...]  # the reference first
     t_s: Array  # (K,) epochs
     movers: tuple[Mover, ...]
-    increments: tuple[Increments, ...]  # of the movers between the epochs
+    increments: tuple[Increments, ...]  # of the movers between the epochs, attitude errors white
     places: Places
     own: tuple[OwnTrack | None, ...]
     absolute: tuple[Array, Array, Array]  # (N, K, 3), (N, K, 3), (N, K, 6, 6), ECEF; NaN where unknown
     links: dict[int, PairEpochs]  # by follower
     noise: dict[int, PairNoise]
     ranges: dict[int, list[RangeRow]]  # by epoch
+    constants: tuple[float, ...]  # of ranges: prior standard deviations of scales and biases
     heights: dict[int, list[HeightRow]]
     notes: tuple[str, ...]
 
@@ -124,13 +132,16 @@ class Formation:
     ) -> RelativeTrack:
         """Filter the flight."""
         moving = self._motion(configuration)
-        sources = self._sources(configuration, moving.size)
-        options = Options(correct, configuration.strong_tracking, observe)
+        constants = self.constants if configuration.calibrate_ranges else ()
+        sources = self._sources(configuration, moving.size + len(constants))
+        losses = self.problem.settings.robust if configuration.robust else {}
+        options = Options(correct, configuration.update, losses, configuration.strong_tracking, constants, observe)
         return filtering.run(moving, sources, self.t_s, self._start(), options)
 
     def _motion(self, c: Configuration) -> Motion:
         if c.motion == "attitude":
-            return AttitudeReferenced(self.movers, self.t_s, self.places.reference_e, self.increments)
+            known = None if c.coloured else self.increments
+            return AttitudeReferenced(self.movers, self.t_s, self.places.reference_e, c.coloured, known)
         return Smooth(c.motion, len(self.names) - 1, self.t_s, c.walk)
 
     def _sources(self, c: Configuration, n: int) -> list[Source]:
@@ -141,14 +152,19 @@ class Formation:
         if "position" in c.kinds:
             sources.append(AbsoluteDifferences(*self.absolute, self.names, n, c.absolute_factor))
         if "range" in c.kinds:
-            sources.append(Distances(self.ranges, n, c.range_scale))
+            first = n - len(self.constants) if c.calibrate_ranges else None
+            sources.append(Distances(self.ranges, n, c.range_scale, first))
         if "height" in c.kinds:
             sources.append(Heights(self.heights, n))
         return sources
 
     def _start(self) -> tuple[Array, Array]:
-        """Followers' velocities and positions at the first epoch, with their covariance: what the own filters say."""
+        """Followers' velocities and positions at the first epoch, with their covariance: as own filters or ranges have them."""
         M = len(self.names) - 1
+        if self.names[0] == GROUND and self.ranges and not any(self.own[1:]):
+            imus = [imu for name in self.names[1:] if (imu := self.problem.vehicle(name).imu) is not None]
+            until = rest_until(imus, float(self.t_s[0]))
+            return placed(self.ranges, self.heights, self.t_s, self.names, until)
         r_e, v_e, P = self.absolute
         x, cov = np.zeros(6 * M), np.zeros((6 * M, 6 * M))
         swap = np.r_[3:6, 0:3]  # own filters have positions first
@@ -192,7 +208,7 @@ def prepare(problem: NavigationProblem, motions: Mapping[str, OwnMotion], receiv
     turning = [arms(C, w, np.asarray(lever)) for (_, _, C, w), lever in zip(at, levers, strict=True)]
     places = Places(at[0][0], at[0][1], np.array([a for a, _ in turning]), np.array([v for _, v in turning]))
     movers = tuple(_mover(name, full[name], frame) for name in names)
-    ranges, skipped = _ranges(problem, names, t_s, [C for _, _, C, _ in at], frame)
+    ranges, constants, skipped = _ranges(problem, names, t_s, [C for _, _, C, _ in at], frame)
     return Formation(
         problem=problem,
         names=names,
@@ -205,6 +221,7 @@ def prepare(problem: NavigationProblem, motions: Mapping[str, OwnMotion], receiv
         links=links,
         noise={i: PairNoise(receivers[names[0]].antenna.noise, receivers[names[i + 1]].antenna.noise) for i in links},
         ranges=ranges,
+        constants=constants,
         heights=_heights(problem, names, t_s) if names[0] == GROUND else {},
         notes=(f"{skipped} ranges to tags that this filter does not place were left out",) if skipped else (),
     )
@@ -278,45 +295,57 @@ def _absolute(tracks: Sequence[OwnTrack | None], t_s: Array, frame: LocalFrame) 
 
 def _ranges(
     problem: NavigationProblem, names: Sequence[str], t_s: Array, C_eb: Sequence[Array], frame: LocalFrame
-) -> tuple[dict[int, list[RangeRow]], int]:
-    """Ranges by epoch, and how many are left out because an end is not placed."""
+) -> tuple[dict[int, list[RangeRow]], tuple[float, ...], int]:
+    """Ranges by epoch, sigmas of their constants, and how many are left out because an end is not placed."""
     found: dict[int, list[RangeRow]] = {}
+    constants: list[float] = []
     skipped = 0
     for model in problem.ranges:
-        skipped += _ranges_of(model, names, t_s, C_eb, frame, found)
-    return found, skipped
+        stream = model.stream
+        places = [_place(tag, names) for tag in stream.tags]
+        numbers: dict[tuple[str, int, int], int] = {}
+        for k, a, b, range_m, sigma_m in zip(
+            _epoch_of(stream.t_s, t_s), stream.tag_a, stream.tag_b, stream.range_m, stream.sigma_m, strict=True
+        ):
+            if k < 0:
+                continue
+            first, second = places[a], places[b]
+            if first is None or second is None or first[0] == second[0]:
+                skipped += 1
+                continue
+            arm = C_eb[second[0]][k] @ second[1] - C_eb[first[0]][k] @ first[1]
+            label = f"{stream.tags[a].name}-{stream.tags[b].name}"
+            pair = (min(a, b), max(a, b)) if model.per_pair else (0, 0)
+            scale, bias = (_constant(numbers, constants, what, pair, sigma) for what, sigma in _told(model))
+            row = RangeRow(first[0], second[0], arm, float(range_m), float(sigma_m), label, scale, bias)
+            found.setdefault(int(k), []).append(row)
+    return found, tuple(constants), skipped
 
 
-def _ranges_of(
-    model: RangeModel,
-    names: Sequence[str],
-    t_s: Array,
-    C_eb: Sequence[Array],
-    frame: LocalFrame,
-    found: dict[int, list[RangeRow]],
+def _told(model: RangeModel) -> tuple[tuple[str, float], tuple[str, float]]:
+    return ("scale", model.scale_sigma), ("bias", model.bias_sigma_m)
+
+
+def _constant(
+    numbers: dict[tuple[str, int, int], int], constants: list[float], what: str, pair: tuple[int, int], sigma: float
 ) -> int:
-    stream, skipped = model.stream, 0
-    epoch = _epoch_of(stream.t_s, t_s)
-    places: list[tuple[int, Array] | None] = []
-    for tag in stream.tags:
-        if tag.vehicle is not None and tag.vehicle in names:
-            places.append((names.index(tag.vehicle), np.asarray(tag.lever_b, float)))
-        elif tag.position_n is not None and names[0] == GROUND:
-            places.append((0, np.asarray(tag.position_n, float)))
-        else:
-            places.append(None)
-    for k, a, b, range_m, sigma_m in zip(epoch, stream.tag_a, stream.tag_b, stream.range_m, stream.sigma_m, strict=True):
-        if k < 0:
-            continue
-        ends = places[a], places[b]
-        if ends[0] is None or ends[1] is None or ends[0][0] == ends[1][0]:
-            skipped += 1
-            continue
-        (i, lever_a), (j, lever_b) = ends[0], ends[1]
-        arm = C_eb[j][k] @ lever_b - C_eb[i][k] @ lever_a
-        label = f"{stream.tags[a].name}-{stream.tags[b].name}"
-        found.setdefault(int(k), []).append(RangeRow(i, j, arm, float(range_m), float(sigma_m), label))
-    return skipped
+    """Number of a range's constant, a new one where it was not met before; -1 where the problem has none."""
+    if not sigma > 0:
+        return -1
+    key = (what, *pair)
+    if key not in numbers:
+        numbers[key] = len(constants)
+        constants.append(sigma)
+    return numbers[key]
+
+
+def _place(tag: Tag, names: Sequence[str]) -> tuple[int, Array] | None:
+    """A tag's vehicle and lever arm; an anchor is one of the ground's. None where this filter does not place it."""
+    if tag.vehicle is not None and tag.vehicle in names:
+        return names.index(tag.vehicle), np.asarray(tag.lever_b, float)
+    if tag.position_n is not None and names[0] == GROUND:
+        return 0, np.asarray(tag.position_n, float)
+    return None
 
 
 def _heights(problem: NavigationProblem, names: Sequence[str], t_s: Array) -> dict[int, list[HeightRow]]:

@@ -192,8 +192,11 @@ def _vehicle(formation: Formation, track: RelativeTrack, i: int) -> VehicleSolut
     return VehicleSolution(name, t_s, r_n, v_n, q, unknown, unknown, P, formation.problem.vehicle(name).truth)
 
 
-RELATIVE = RelativeFilter(
-    "relative",
-    "relative filter: attitudes and accelerometers of all vehicles, two or many",
-    Configuration(kinds=tuple(kind for kind in KINDS if kind not in ("position", "velocity"))),  # they say the codes again
+HONEST = Configuration(
+    coloured=True,
+    kinds=tuple(kind for kind in KINDS if kind not in ("position", "velocity")),  # absolute differences say the codes again
+    calibrate_ranges=True,
+    update="iterated",
+    robust=True,
 )
+RELATIVE = RelativeFilter("relative", "relative filter: attitudes and accelerometers of all vehicles, two or many", HONEST)

@@ -12,9 +12,10 @@ the way made, which integrates it exactly; gravity differs by its value at the s
 g / R (3 u u' - I) along the way, u the vertical.
 
 Attitude errors psi, C_true = (I + [psi x]) C, push the velocity by psi x f. The source takes them for white; attitude systems err
-slowly, and white noise of density 2 sigma^2 tau spreads the velocity as a Gauss-Markov error of correlation time tau does.
+slowly. White noise of density 2 sigma^2 tau spreads the velocity as a Gauss-Markov error of correlation time tau does, but only
+over times longer than tau: within them it promises too little. `coloured` carries psi as states instead.
 
-    states      v_1 r_1 ... v_M r_M | df_0 ... df_M         attitude-referenced
+    states      v_1 r_1 ... v_M r_M | df_0 ... df_M         attitude-referenced, and psi_0 ... psi_M where coloured
                 v_1 r_1 ... v_M r_M | a_1 ... a_M           constant acceleration, walking
                 v_1 r_1 ... v_M r_M                         constant velocity, walking
 
@@ -29,6 +30,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 from numba import njit
+from scipy.linalg import block_diag
 
 from factorgraph.attitude import skew
 from factorgraph.errors import InputError, not_negative, positive
@@ -48,16 +50,17 @@ class AccelModel:
     white_mps2_rthz: float
     markov_mps2: float  # steady standard deviation of df
     markov_s: float
-    attitude_rad_rthz: tuple[float, float, float]  # errors as white noise about east, north, up: sigma sqrt(2 tau)
+    attitude_rad: tuple[float, float, float]  # steady standard deviations about east, north and up
+    attitude_s: float  # correlation time of the attitude errors
 
     def __post_init__(self) -> None:
-        positive(self, "markov_s")
+        positive(self, "markov_s", "attitude_s")
         not_negative(self, "white_mps2_rthz", "markov_mps2")
-        if not min(self.attitude_rad_rthz) >= 0:
-            raise InputError(f"AccelModel.attitude_rad_rthz must not be negative, got {self.attitude_rad_rthz}")
+        if not min(self.attitude_rad) >= 0:
+            raise InputError(f"AccelModel.attitude_rad must not be negative, got {self.attitude_rad}")
 
 
-PERFECT = AccelModel(0.0, 0.0, 1.0, (0.0, 0.0, 0.0))  # of a reference that stands on the ground
+PERFECT = AccelModel(0.0, 0.0, 1.0, (0.0, 0.0, 0.0), 1.0)  # of a reference that stands on the ground
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,21 +81,23 @@ class Mover:
 
 @dataclass(frozen=True, slots=True)
 class Increments:
-    """A vehicle over the intervals between K + 1 epochs: gained velocity and way, and 9 states (v, r, df)."""
+    """A vehicle over the intervals between K + 1 epochs: gained velocity and way, and 12 states (v, r, df, psi)."""
 
     dv: Array  # (K, 3)
     dr: Array  # (K, 3)
-    Phi: Array  # (K, 9, 9)
-    Q: Array  # (K, 9, 9)
+    Phi: Array  # (K, 12, 12)
+    Q: Array  # (K, 12, 12)
 
 
 @njit(cache=True)
-def _sample(C: Array, f: Array, S: Array, white: float, tau: float, gm: float, dt: float) -> tuple[Array, Array]:
-    """Transition and noise (9, 9) of one sample; S (3, 3) the attitudes' density in e."""
-    Phi, Q = np.eye(9), np.zeros((9, 9))
-    decay = np.exp(-dt / tau)
+def _sample(
+    C: Array, f: Array, S: Array, coloured: bool, white: float, tau: float, gm: float, tau_psi: float, dt: float
+) -> tuple[Array, Array]:
+    """Transition and noise (12, 12) of one sample; S (3, 3) the attitudes' steady covariance in e."""
+    Phi, Q = np.eye(12), np.zeros((12, 12))
+    decay, decay_psi = np.exp(-dt / tau), np.exp(-dt / tau_psi)
     X = np.array([[0.0, -f[2], f[1]], [f[2], 0.0, -f[0]], [-f[1], f[0], 0.0]])
-    q = X @ S @ X.T
+    q = np.zeros((3, 3)) if coloured else X @ S @ X.T * (2.0 * tau_psi)
     for i in range(3):
         q[i, i] += white * white
         Phi[3 + i, i] = dt
@@ -106,19 +111,24 @@ def _sample(C: Array, f: Array, S: Array, white: float, tau: float, gm: float, d
             Q[i, j] = q[i, j] * dt
             Q[3 + i, j] = Q[i, 3 + j] = 0.5 * q[i, j] * dt * dt
             Q[3 + i, 3 + j] = q[i, j] * dt * dt * dt / 3.0
+            if coloured:
+                Phi[i, 9 + j] = -X[i, j] * dt
+                Phi[3 + i, 9 + j] = -0.5 * X[i, j] * dt * dt
+                Q[9 + i, 9 + j] = S[i, j] * (1.0 - decay_psi * decay_psi)
+        Phi[9 + i, 9 + i] = decay_psi
     return Phi, Q
 
 
 @njit(cache=True)
 def _integrate(
-    edges: Array, f: Array, C: Array, S: Array, white: float, tau: float, gm: float, t: Array
+    edges: Array, f: Array, C: Array, S: Array, coloured: bool, white: float, tau: float, gm: float, tau_psi: float, t: Array
 ) -> tuple[Array, Array, Array, Array]:
     K, n = len(t) - 1, len(f)
     dv, dr = np.zeros((K, 3)), np.zeros((K, 3))
-    Phi, Q = np.zeros((K, 9, 9)), np.zeros((K, 9, 9))
+    Phi, Q = np.zeros((K, 12, 12)), np.zeros((K, 12, 12))
     s = max(np.searchsorted(edges, t[0], side="right") - 1, 0)
     for k in range(K):
-        Phi[k] = np.eye(9)
+        Phi[k] = np.eye(12)
         at = t[k]
         while at < t[k + 1]:
             while s < n - 1 and edges[s + 1] <= at:
@@ -128,14 +138,14 @@ def _integrate(
             for i in range(3):
                 dr[k, i] += dv[k, i] * dt + 0.5 * f[s, i] * dt * dt
                 dv[k, i] += f[s, i] * dt
-            step, noise = _sample(C[s], f[s], S, white, tau, gm, dt)
+            step, noise = _sample(C[s], f[s], S, coloured, white, tau, gm, tau_psi, dt)
             Phi[k] = step @ Phi[k]
             Q[k] = kalman.predict(Q[k], step, noise)
             at = until
     return dv, dr, Phi, Q
 
 
-def integrate(mover: Mover, t_s: Array) -> Increments:
+def integrate(mover: Mover, t_s: Array, coloured: bool = False) -> Increments:
     """A vehicle between epochs t_s (K + 1,). Raises InputError where its samples do not cover them."""
     if t_s[0] < mover.edges[0] - 1e-3 or t_s[-1] > mover.edges[-1] + 0.05:
         raise InputError(
@@ -143,8 +153,13 @@ def integrate(mover: Mover, t_s: Array) -> Increments:
             f"the epochs {t_s[0]:.3f} to {t_s[-1]:.3f} s"
         )
     m = mover.model
-    S = mover.C_en.T @ np.diag(np.square(m.attitude_rad_rthz)) @ mover.C_en
-    return Increments(*_integrate(mover.edges, mover.f_e, mover.C_eb, S, m.white_mps2_rthz, m.markov_s, m.markov_mps2, t_s))
+    scales = (m.white_mps2_rthz, m.markov_s, m.markov_mps2, m.attitude_s)
+    return Increments(*_integrate(mover.edges, mover.f_e, mover.C_eb, _steady(mover), coloured, *scales, t_s))
+
+
+def _steady(mover: Mover) -> Array:
+    """Covariance (3, 3) of an attitude error psi in Earth-fixed axes."""
+    return np.asarray(mover.C_en.T @ np.diag(np.square(mover.model.attitude_rad)) @ mover.C_en)
 
 
 class Motion(Protocol):
@@ -177,49 +192,67 @@ def error(M: int, j: int) -> slice:
     return slice(6 * M + 3 * j, 6 * M + 3 * j + 3)
 
 
+def tilt(M: int, j: int) -> slice:
+    """States of psi of vehicle j, the reference 0, where attitude errors are coloured."""
+    return slice(9 * M + 3 + 3 * j, 9 * M + 6 + 3 * j)
+
+
 class AttitudeReferenced:
     """Dead reckoning of all vehicles with their attitudes and accelerometers.
 
     reference_e (K + 1, 3): where the reference is, ECEF, for gravity; a hundred metres are near enough. `increments`: what
-    `integrate` gave for the same movers and times, to save time.
+    `integrate` gave for the same movers, times and colour, to save time.
     """
 
     def __init__(
-        self, movers: Sequence[Mover], t_s: Array, reference_e: Array, increments: Sequence[Increments] | None = None
+        self,
+        movers: Sequence[Mover],
+        t_s: Array,
+        reference_e: Array,
+        coloured: bool = False,
+        increments: Sequence[Increments] | None = None,
     ) -> None:
         if len(movers) < 2:
             raise InputError("a formation needs a reference and at least one follower")
-        self.n_followers = len(movers) - 1
-        self.size = 6 * self.n_followers + 3 * len(movers)
+        self.n_followers, self.coloured = len(movers) - 1, coloured
+        self.size = 6 * self.n_followers + (6 if coloured else 3) * len(movers)
         self.movers, self.t_s, self.reference_e = tuple(movers), t_s, reference_e
-        self.increments = increments or [integrate(mover, t_s) for mover in movers]
+        self.increments = increments or [integrate(mover, t_s, coloured) for mover in movers]
         self._gradient = _gravity_gradient(reference_e[len(reference_e) // 2])
 
     def start(self) -> Array:
-        return np.diag(np.repeat([m.model.markov_mps2**2 for m in self.movers], 3))
+        own = [m.model.markov_mps2**2 * np.eye(3) for m in self.movers]
+        return np.asarray(block_diag(*own, *([_steady(m) for m in self.movers] if self.coloured else [])))
+
+    def _own(self, j: int) -> list[int]:
+        """States of a vehicle's own errors."""
+        M = self.n_followers
+        parts = [error(M, j), tilt(M, j)] if self.coloured else [error(M, j)]
+        return [state for part in parts for state in range(part.start, part.stop)]
 
     def predict(self, k: int, x: Array) -> tuple[Array, Array, Array]:
         M, T = self.n_followers, float(self.t_s[k] - self.t_s[k - 1])
         Phi, Q = np.zeros((self.size, self.size)), np.zeros((self.size, self.size))
-        own = [(part.Phi[k - 1], part.Q[k - 1]) for part in self.increments]
-        gradient = self._gradient
         pair = np.eye(6)
         pair[:3, :3] -= 2.0 * T * TURN
         pair[3:, :3] = T * np.eye(3) - T * T * TURN
-        pair[:3, 3:] = T * gradient
-        pair[3:, 3:] += 0.5 * T * T * gradient
-        for i in range(M):
-            mine = slice(6 * i, 6 * i + 6)
-            Phi[mine, mine] = pair
-            Phi[mine, error(M, 0)], Phi[mine, error(M, i + 1)] = -own[0][0][:6, 6:], own[i + 1][0][:6, 6:]
-            Q[mine, error(M, 0)], Q[mine, error(M, i + 1)] = -own[0][1][:6, 6:], own[i + 1][1][:6, 6:]
-            Q[error(M, 0), mine], Q[error(M, i + 1), mine] = Q[mine, error(M, 0)].T, Q[mine, error(M, i + 1)].T
-            for j in range(M):
-                Q[mine, 6 * j : 6 * j + 6] = own[0][1][:6, :6] + (own[i + 1][1][:6, :6] if i == j else 0.0)
+        pair[:3, 3:] = T * self._gradient
+        pair[3:, 3:] += 0.5 * T * T * self._gradient
         for j in range(M + 1):
-            Phi[error(M, j), error(M, j)], Q[error(M, j), error(M, j)] = own[j][0][6:, 6:], own[j][1][6:, 6:]
+            own, part = self._own(j), self.increments[j]
+            errors = slice(6, 6 + len(own))
+            Phi[np.ix_(own, own)], Q[np.ix_(own, own)] = part.Phi[k - 1][errors, errors], part.Q[k - 1][errors, errors]
+            for i in range(M) if j == 0 else (j - 1,):  # the reference is in every difference
+                mine, sign = slice(6 * i, 6 * i + 6), -1.0 if j == 0 else 1.0
+                Phi[mine, own] = sign * part.Phi[k - 1][:6, errors]
+                Q[mine, own] = sign * part.Q[k - 1][:6, errors]
+                Q[own, mine] = Q[mine, own].T
+                for other in range(M) if j == 0 else (i,):
+                    Q[mine, 6 * other : 6 * other + 6] += part.Q[k - 1][:6, :6]
+        for i in range(M):
+            Phi[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = pair
         out = Phi @ x
-        for i in range(M):  # what velocity and df do not bring; gravity's difference at r is exact, not its gradient times r
+        for i in range(M):  # what velocity and errors do not bring; gravity's difference at r is exact, not its gradient times r
             dv, dr = self._gained(k - 1, i + 1, x[position(i)], T)
             out[velocity(i)] += dv
             out[position(i)] += dr

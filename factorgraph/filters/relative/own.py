@@ -16,7 +16,8 @@ import numpy as np
 
 from factorgraph.attitude import matrix_from_quat
 from factorgraph.errors import InputError
-from factorgraph.filters import tightly_coupled
+from factorgraph.filters import ahrs, tightly_coupled
+from factorgraph.filters.ahrs import AhrsSettings, Aiding
 from factorgraph.filters.inertial import INERTIAL, ImuModel
 from factorgraph.filters.relative.flight import OwnMotion, OwnTrack, attitude_at
 from factorgraph.filters.relative.motion import AccelModel
@@ -27,6 +28,8 @@ from factorgraph.models.receivers import Receiver
 from factorgraph.problem import ImuNoise, NavigationProblem, Vehicle
 from factorgraph.types import Array
 
+UNAIDED, AIDED = AhrsSettings(accel_mps2=1.0), AhrsSettings()  # without velocities, accelerations are not known
+VELOCITY_DOP = 2.0  # standard deviation of a velocity component over that of a Doppler
 GYRO_MARKOV_S = 3600.0  # over which a walking gyro bias is said to return
 ACCEL = slice(INERTIAL["accel_markov"].start - INERTIAL["gyro_constant"].start, None)  # of a track's sensor errors
 
@@ -35,10 +38,12 @@ ACCEL = slice(INERTIAL["accel_markov"].start - INERTIAL["gyro_constant"].start, 
 class OwnSettings:
     """How vehicles are prepared."""
 
+    attitude_s: float = 5.0  # correlation time of an attitude system's errors
+    ahrs_s: float = 60.0  # and of the own attitude filter's, which trusts its gyros for about so long
+    ahrs: AhrsSettings = UNAIDED
+    aided_ahrs: AhrsSettings = AIDED
     use_doppler: bool = True  # in the vehicles' own filters; the source has code alone
-    calibrate: bool = (
-        False  # take the own filter's accelerometer errors off, as the source does; their steps are no Markov process
-    )
+    calibrate: bool = False  # take the own filter's accelerometer errors off, as the source does; their steps are no noise
 
 
 def own_motions(
@@ -57,25 +62,55 @@ def own_motion(problem: NavigationProblem, vehicle: Vehicle, receiver: Receiver 
     """Of one vehicle. Raises InputError where its attitude cannot be had."""
     assert vehicle.imu is not None
     edges, f, w = sample_means(vehicle.imu)
-    attitude = told_attitude(vehicle)
+    attitude, correlation_s = _attitude(problem, vehicle, receiver, settings)
     C = attitude_at(attitude.t_s, attitude.q_nb, 0.5 * (edges[1:] + edges[:-1]))
-    east, north, up = (np.median(attitude.sigma_rad, axis=0) * np.sqrt(np.median(np.diff(attitude.t_s)))).tolist()
     noise = vehicle.imu_noise
-    model = AccelModel(noise.accel_mps2_rthz, noise.accel_bias_mps2, _markov_s(noise), (east, north, up))
+    steady = _steady_sigma(attitude, correlation_s)
+    model = AccelModel(noise.accel_mps2_rthz, noise.accel_bias_mps2, _markov_s(noise), steady, correlation_s)
     if receiver is None:
         return OwnMotion(edges, f, w, C, model, None)
-    found = _follow(problem, receiver, attitude, settings)
+    found = _follow(problem, receiver, attitude, np.square(steady), settings)
     if settings.calibrate:
         f = f - _before(edges, found)
     return OwnMotion(edges, f, w, C, model, OwnTrack(found.t_s, found.r_n, found.v_n, found.P[:, :6, :6]))
 
 
-def told_attitude(vehicle: Vehicle) -> AttitudeStream:
-    """The attitude system that tells all three angles."""
+def _attitude(
+    problem: NavigationProblem, vehicle: Vehicle, receiver: Receiver | None, settings: OwnSettings
+) -> tuple[AttitudeStream, float]:
+    """The attitude system that tells all three angles, or the vehicle's own attitude filter, and how long its errors last."""
     for stream in vehicle.attitudes:
         if np.all(np.isfinite(stream.sigma_rad)) and len(stream.t_s) > 1:
-            return stream
-    raise InputError(f"vehicle {vehicle.name}: no attitude system tells roll, pitch and heading")
+            return stream, settings.attitude_s
+    assert vehicle.imu is not None
+    magnetics = vehicle.magnetics[0] if vehicle.magnetics else None
+    heading = None if vehicle.heading_hint_rad is None else (vehicle.heading_hint_rad, vehicle.heading_sigma_rad)
+    if magnetics is None and heading is None:
+        raise InputError(
+            f"vehicle {vehicle.name}: nothing tells its heading; declare an attitude system, a magnetometer or heading_hint_deg"
+        )
+    aiding = None if receiver is None else _aiding(problem, receiver)
+    tuned = settings.ahrs if aiding is None else settings.aided_ahrs
+    track = ahrs.run(vehicle.imu, vehicle.imu_noise, problem.frame, magnetics, aiding, tuned, heading)
+    return track.stream(settings.ahrs_s), settings.ahrs_s
+
+
+def _aiding(problem: NavigationProblem, receiver: Receiver) -> Aiding | None:
+    """Single-point positions and velocities, for the attitude filter."""
+    point, t_s = receiver.point, receiver.antenna.stream.t_s - receiver.clock_s
+    known = np.isfinite(point.r_ecef[:, 0]) & np.isfinite(point.v_ecef[:, 0])
+    if np.sum(known) < 2:
+        return None
+    frame = problem.frame
+    sigma = VELOCITY_DOP * receiver.antenna.noise.doppler_mps
+    return Aiding(t_s[known], frame.from_ecef(point.r_ecef[known]), frame.rotate_from_ecef(point.v_ecef[known]), sigma)
+
+
+def _steady_sigma(attitude: AttitudeStream, correlation_s: float) -> tuple[float, float, float]:
+    """Standard deviations of one attitude about east, north and up, of told ones that count correlated samples once."""
+    samples = max(1.0, 2.0 * correlation_s / float(np.median(np.diff(attitude.t_s))))
+    east, north, up = (np.median(attitude.sigma_rad, axis=0) / np.sqrt(samples)).tolist()
+    return east, north, up
 
 
 def _markov_s(noise: ImuNoise) -> float:
@@ -83,8 +118,10 @@ def _markov_s(noise: ImuNoise) -> float:
     return 2.0 * (noise.accel_bias_mps2 / noise.accel_bias_walk_mps2_rts) ** 2
 
 
-def _follow(problem: NavigationProblem, receiver: Receiver, attitude: AttitudeStream, settings: OwnSettings) -> TightTrack:
-    """The vehicle's own filter over the whole flight."""
+def _follow(
+    problem: NavigationProblem, receiver: Receiver, attitude: AttitudeStream, variance: Array, settings: OwnSettings
+) -> TightTrack:
+    """The vehicle's own filter over the whole flight; variance (3,) of the attitude it starts from."""
     imu, gnss = receiver.vehicle.imu_noise, receiver.antenna.noise
     model = ImuModel(
         gyro_rps_rthz=imu.gyro_rps_rthz,
@@ -98,17 +135,9 @@ def _follow(problem: NavigationProblem, receiver: Receiver, attitude: AttitudeSt
     tight = TightSettings(
         code_m=gnss.absolute_code_m, doppler_mps=gnss.doppler_mps, elevation=gnss.elevation, use_doppler=settings.use_doppler
     )
-    first = np.searchsorted(attitude.t_s, receiver.antenna.stream.t_s[0])
-    at = min(int(first), len(attitude.t_s) - 1)
-    start = point_start(
-        receiver, problem.frame, matrix_from_quat(attitude.q_nb[at : at + 1])[0], np.diag(_first_sigma(attitude) ** 2)
-    )
+    at = min(int(np.searchsorted(attitude.t_s, receiver.antenna.stream.t_s[0])), len(attitude.t_s) - 1)
+    start = point_start(receiver, problem.frame, matrix_from_quat(attitude.q_nb[at : at + 1])[0], np.diag(variance))
     return tightly_coupled.run(receiver, problem.frame, start, model, tight)
-
-
-def _first_sigma(attitude: AttitudeStream) -> Array:
-    """Standard deviation (3,) of one attitude: told ones count correlated samples once, which a single one need not."""
-    return np.asarray(attitude.sigma_rad[0])
 
 
 def _before(edges: Array, track: TightTrack) -> Array:

@@ -3,12 +3,13 @@
     DD P        = -(e_s - e_1) r                          + noise       e: line of sight from between both vehicles
     -lam DD D   = -(e_s - e_1) v - (de_s - de_1)/dt r     + noise       1: the highest satellite
     r_abs, v_abs = r, v                                   + noise       differences of the vehicles' own filters
-    range       = scale |r_b + a_b - r_a - a_a|           + noise       a: arms from a body's origin to its tag
+    range       = (scale + k) |r_b + a_b - r_a - a_a| + b + noise       a: arms from a body's origin to its tag
 
 in Earth-fixed axes. Double differences are not linearised: what is measured is set against exact ranges at the prediction, and
 the row carries the difference, z = measured - predicted(r) + H r. Followers share the reference's noise, and all differences to
 one pivot share the pivot's; both are in R. Differences of the vehicles' own filters were computed from the same code: their
-covariance is multiplied (`AbsoluteDifferences.factor`) because they are not independent of the double differences.
+covariance is multiplied (`AbsoluteDifferences.factor`) because they are not independent of the double differences. Errors k of
+the scale and biases b of ranges may be constants of the filter; the source estimates neither.
 
 Source: Lu et al. (2024), eqs. 32 to 35; spec ahrs_tdo.md, section 2.4, errata E17 to E19 and E28; spec common.md, section 5.
 """
@@ -37,10 +38,10 @@ FEWEST = 2  # satellites of a difference
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Measurements of one epoch; n states, m rows. Rows of distances are h = scale |D x + d|, the others h = H x."""
+    """Measurements of one epoch; n states, m rows. Rows of distances are h = (scale + k) |D x + d| + H x, the others h = H x."""
 
     z: Array  # (m,)
-    H: Array  # (m, n); of distances not used
+    H: Array  # (m, n); of distances their bias
     R: Array  # (m, m)
     kind: IntArray  # (m,) of KINDS
     labels: tuple[str, ...]  # (m,) vehicles, and satellites less pivot or axis
@@ -48,6 +49,11 @@ class Rows:
     norm_D: Array = field(default_factory=lambda: np.zeros((0, 3, 0)))  # (q, 3, n)
     norm_d: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (q, 3)
     norm_scale: Array = field(default_factory=lambda: np.zeros(0))  # (q,)
+    norm_state: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (q,) the state k, -1 without
+
+    def scales(self, x: Array) -> Array:
+        """Scale (q,) of every distance at x (n,)."""
+        return self.norm_scale + np.where(self.norm_state >= 0, x[self.norm_state], 0.0)
 
     def linearised(self, x: Array) -> tuple[Array, Array]:
         """Innovations (m,) and rows (m, n) at x (n,); a distance of zero has no direction and says nothing."""
@@ -56,9 +62,11 @@ class Rows:
             way = self.norm_D @ x + self.norm_d
             size = np.linalg.norm(way, axis=1)
             unit = way / np.where(size > 0, size, np.inf)[:, None]
+            scale, told = self.scales(x), np.flatnonzero(self.norm_state >= 0)
             H = H.copy()
-            H[self.norm_rows] = self.norm_scale[:, None] * np.einsum("qa,qan->qn", unit, self.norm_D)
-            nu[self.norm_rows] = self.z[self.norm_rows] - self.norm_scale * size
+            H[self.norm_rows] += scale[:, None] * np.einsum("qa,qan->qn", unit, self.norm_D)
+            H[self.norm_rows[told], self.norm_state[told]] += size[told]
+            nu[self.norm_rows] -= scale * size
         return nu, H
 
 
@@ -96,6 +104,7 @@ def stacked(parts: Sequence[Rows]) -> Rows:
         np.concatenate([part.norm_D if len(part.norm_rows) else np.zeros((0, 3, parts[0].H.shape[1])) for part in parts]),
         np.concatenate([part.norm_d for part in parts]),
         np.concatenate([part.norm_scale for part in parts]),
+        np.concatenate([part.norm_state for part in parts]),
     )
 
 
@@ -259,27 +268,39 @@ class RangeRow:
     range_m: float
     sigma_m: float
     label: str
+    scale: int = -1  # which of the filter's constants is the error of its scale, -1: none
+    bias: int = -1
 
 
 class Distances:
-    """Ranges between the vehicles, by epoch; `scale` is the crystal's factor where known, which the source does not estimate."""
+    """Ranges between the vehicles, by epoch; `scale` is the crystal's factor where known.
 
-    def __init__(self, by_epoch: dict[int, list[RangeRow]], n: int, scale: float = 1.0) -> None:
-        self.by_epoch, self.n, self.scale = by_epoch, n, scale
+    first_constant: the state of the constants that rows name; None: ranges are believed to have none.
+    """
+
+    def __init__(
+        self, by_epoch: dict[int, list[RangeRow]], n: int, scale: float = 1.0, first_constant: int | None = None
+    ) -> None:
+        self.by_epoch, self.n, self.scale, self.first = by_epoch, n, scale, first_constant
 
     def rows(self, k: int, x: Array) -> Rows | None:
         found = self.by_epoch.get(k, [])
         if not found:
             return None
         m = len(found)
-        D = np.zeros((m, 3, self.n))
+        D, H = np.zeros((m, 3, self.n)), np.zeros((m, self.n))
+        state = np.full(m, -1)
         for row, one in enumerate(found):
             for vehicle, sign in ((one.b, 1.0), (one.a, -1.0)):
                 if vehicle > 0:
                     D[row, :, position(vehicle - 1)] += sign * np.eye(3)
+            if self.first is not None and one.bias >= 0:
+                H[row, self.first + one.bias] = 1.0
+            if self.first is not None and one.scale >= 0:
+                state[row] = self.first + one.scale
         return Rows(
             np.array([one.range_m for one in found]),
-            np.zeros((m, self.n)),
+            H,
             np.diag([one.sigma_m**2 for one in found]),
             np.full(m, RANGE),
             tuple(one.label for one in found),
@@ -287,6 +308,7 @@ class Distances:
             D,
             np.array([one.arm_e for one in found]),
             np.full(m, self.scale),
+            state,
         )
 
 

@@ -1,0 +1,76 @@
+"""Any recursive filter with a search that corrects it: `getattr(corrected, "eskf-tdo")`, or `create` with other settings.
+
+A stage is judged by the normalised innovation squared of the rows that a filter judges (`swarm.judgement`). Where it does not
+fit, the state is decided anew as the least of
+
+    e'e + d' inv(P) d,   e = z - H d whitened,
+
+over deviations d from the prediction (O3), in coordinates whitened by the posterior of the states that rows see; the others
+follow. Rows are as the filter linearised them. Of a filter that takes its rows as they are, the posterior is where that is least,
+and a search can at best return to it; one that weighs rows or noise (huber, rackf, sage-husa, iae, rae, forgetting) is taken back
+to the noise as stated. Where a covariance is not sound, the posterior stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph.filters.correctors import Case, Searched
+from factorgraph.filters.methods import FILTERS
+from factorgraph.filters.recursive import Recursive
+from factorgraph.registry import RECURSIVE
+from factorgraph.types import Array, BoolArray
+from scenarios.methods import CORRECTED, SMOOTHED
+from swarm.corrector import Corrector, CorrectorSettings
+from swarm.judgement import Rule, judge
+from swarm.snapshot import Snapshot
+
+SETTINGS = CorrectorSettings(coordinates="whitened")
+SEED = 0  # of every run: a flight has one solution
+
+
+class Correction:
+    """Judges and corrects the stages of one run; `triggered` counts them."""
+
+    def __init__(self, search: str, settings: CorrectorSettings = SETTINGS) -> None:
+        self.rule = settings.rule
+        self.corrector = Corrector(replace(settings, rule=Rule("always")), search)
+        self.rng, self.triggered = np.random.default_rng(SEED), 0
+
+    def __call__(self, case: Case) -> tuple[Array, Array] | None:
+        """State and covariance of a stage that was corrected, none where it fits."""
+        if not self._doubted(case):
+            return None
+        self.triggered += 1
+        try:
+            found = self.corrector(_snapshot(case, np.ones(len(case.e), np.bool_), None), self.rng)
+        except np.linalg.LinAlgError:
+            return None
+        return found.x, found.P
+
+    def _doubted(self, case: Case) -> bool:
+        if self.rule.form in ("always", "never"):
+            return self.rule.form == "always" and bool(case.H.any())
+        return case.dof > 0 and judge(self.rule, _snapshot(case, case.judged, case.dof)).triggered
+
+
+def _snapshot(case: Case, rows: BoolArray, dof: float | None) -> Snapshot:
+    e, H = case.e[rows], case.H[rows]
+    return Snapshot(np.zeros(len(case.x_post)), case.P_prior, case.x_post, case.P_post, e, np.eye(len(e)), H, dof=dof)
+
+
+def create(name: str, settings: CorrectorSettings = SETTINGS, integers: bool | None = None) -> Recursive:
+    """A method of the family FILTER-SEARCH; `integers` as in `Recursive`. Raises KeyError for an unknown filter."""
+    alone = name.removesuffix(SMOOTHED)
+    plain, search = next((f, alone[len(f) + 1 :]) for f in sorted(FILTERS, key=len, reverse=True) if alone.startswith(f"{f}-"))
+    method = FILTERS[plain]
+    corrected = replace(method, corrector=lambda: Searched(method.corrector(), Correction(search, settings)))
+    return Recursive(name, f"{RECURSIVE[plain]}, corrected by {search}", corrected, name.endswith(SMOOTHED), integers)
+
+
+def __getattr__(name: str) -> Recursive:
+    if name not in CORRECTED.names:
+        raise AttributeError(f"module {__name__} has no attribute {name}")
+    return create(name)

@@ -1,0 +1,149 @@
+"""The relative filter on simulated flights of two and three UAVs: rows, truth without noise, pairs, as a method."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph.errors import InputError
+from factorgraph.filters.relative import flight, rows
+from factorgraph.filters.relative.flight import Configuration, Formation, prepare, truth_of
+from factorgraph.filters.relative.motion import position, velocity
+from factorgraph.filters.relative.own import own_motions
+from factorgraph.models.receivers import receivers
+from factorgraph.problem import NavigationProblem
+from factorgraph.registry import solve
+from factorgraph.solution import Status
+from factorgraph.types import Array
+from scenarios.published import ahrs_tdo
+from scenarios.simulate import simulate
+from tests.helpers import numerical_jacobian
+
+
+def flown(n: int, noise_scale: float, seed: int = 3, duration_s: float = 60.0) -> NavigationProblem:
+    scene = ahrs_tdo.scenario(n=n)
+    info = scene.scenario.model_copy(update={"duration_s": duration_s, "noise_scale": noise_scale})
+    uwb = tuple(table.model_copy(update={"scale_ppm": 0.0}) for table in scene.range)
+    return ahrs_tdo.without_phases(simulate(scene.model_copy(update={"scenario": info, "range": uwb}), seed).problem)
+
+
+def formation_of(problem: NavigationProblem) -> Formation:
+    rx = receivers(problem)
+    return prepare(problem, own_motions(problem, rx), rx)
+
+
+@pytest.fixture(scope="module")
+def exact() -> Formation:
+    return formation_of(flown(3, 0.0))
+
+
+@pytest.fixture(scope="module")
+def noisy() -> NavigationProblem:
+    return flown(2, 1.0)
+
+
+def true_states(formation: Formation, k: int, n: int) -> Array:
+    x = np.zeros(n)
+    for i, name in enumerate(formation.names[1:]):
+        true = truth_of(formation, formation.names[0], name)
+        assert true is not None
+        x[position(i)], x[velocity(i)] = true[0][k], true[1][k]
+    return x
+
+
+def test_check_6_rows_are_derivatives_and_labelled(exact: Formation) -> None:
+    c = Configuration()
+    moving = exact._motion(c)
+    sources = exact._sources(c, moving.size)
+    x = true_states(exact, 20, moving.size)
+
+    def innovations(d: Array) -> Array:
+        return rows.stacked([found for s in sources if (found := s.rows(20, x + d)) is not None]).linearised(x + d)[0]
+
+    found = rows.stacked([part for s in sources if (part := s.rows(20, x)) is not None])
+    nu, H = found.linearised(x)
+    np.testing.assert_allclose(H, -numerical_jacobian(innovations, moving.size, 0.1), atol=1e-5)
+    kinds = [rows.KINDS[k] for k in found.kind]
+    m = kinds.count("code") // 2
+    absolute = 2 * (3 * ["position"] + 3 * ["velocity"])
+    assert kinds == 2 * m * ["code"] + 2 * m * ["doppler"] + absolute + 3 * ["range"]
+    pivots = {label.split("-")[-1] for label, kind in zip(found.labels, kinds, strict=True) if kind == "code"}
+    assert len(pivots) == 1 and found.labels[0].startswith("follower G")
+    assert found.labels[-3:] == ("leader-follower", "leader-follower-2", "follower-follower-2")
+    assert np.max(np.abs(nu[found.kind == rows.CODE])) < 1e-3  # without noise, at the truth, each row says nothing
+    assert np.max(np.abs(nu[found.kind == rows.DOPPLER])) < 1e-4
+    assert np.max(np.abs(nu[found.kind == rows.RANGE])) < 1e-4
+
+
+def test_differences_share_noise_as_stated(exact: Formation) -> None:
+    c = Configuration(kinds=("code", "doppler"))
+    source = exact._sources(c, 21)[0]
+    found = source.rows(20, true_states(exact, 20, 21))
+    assert found is not None
+    code = found.kind == rows.CODE
+    R = found.R[np.ix_(code, code)]
+    m = len(R) // 2
+    sigma = exact.noise[0].rover.code_m
+    np.testing.assert_allclose(np.diag(R), 4 * sigma**2)
+    assert R[0, 1] == pytest.approx(2 * sigma**2)  # one pivot
+    assert R[0, m] == pytest.approx(2 * sigma**2)  # one reference: its satellite and its pivot
+    assert R[0, m + 1] == pytest.approx(sigma**2)
+    assert np.linalg.eigvalsh(found.R).min() > 0
+
+
+def test_without_noise_the_truth_comes_back(exact: Formation) -> None:
+    track = exact.run(Configuration())
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        r, v, P = track.pair(a, b)
+        true = truth_of(exact, exact.names[a], exact.names[b])
+        assert true is not None
+        assert np.linalg.norm(r[-1] - true[0][-1]) < 0.02 and np.linalg.norm(v[-1] - true[1][-1]) < 2e-3
+        assert np.linalg.eigvalsh(P[-1]).min() > 0
+
+
+@pytest.mark.parametrize("motion", ["velocity", "acceleration"])
+def test_smooth_motions_follow_as_well(exact: Formation, motion: str) -> None:
+    track = exact.run(Configuration(motion=motion, walk=0.5))  # type: ignore[arg-type]
+    true = truth_of(exact, "leader", "follower")
+    assert true is not None
+    assert np.linalg.norm(track.pair(0, 1)[0][-1] - true[0][-1]) < 0.3
+
+
+def test_as_a_method(noisy: NavigationProblem) -> None:
+    solution = solve(noisy, "relative")
+    pair = solution.pair("leader", "follower")
+    assert solution.diagnostics.status is Status.CONVERGED
+    assert pair.truth_enu is not None and pair.truth_velocity_enu is not None
+    e = pair.baseline_enu - pair.truth_enu
+    z = e[-20:] / np.sqrt(np.diagonal(pair.P[-20:, :3, :3], axis1=1, axis2=2))
+    assert np.max(np.abs(z)) < 4.5 and np.sqrt(np.mean(e[-20:] ** 2)) < 2.0
+    assert np.min(pair.n_sat) >= 6
+    assert {solution.residuals.kind[k] for k in np.unique(solution.residuals.kind_index)} == {"code", "doppler", "range"}
+    assert np.all(np.isfinite(solution.vehicle("follower").r_n))
+    assert 0.5 < np.mean(solution.diagnostics.nis / solution.diagnostics.nis_dof) < 1.5
+
+
+def test_a_wanted_pair_of_followers() -> None:
+    problem = flown(3, 1.0, duration_s=20.0)
+    pair = replace(problem.links[0], reference="follower", rover="follower-2")
+    solution = solve(replace(problem, pairs=(pair,)), "relative")
+    assert [(p.reference, p.rover) for p in solution.pairs] == [("follower", "follower-2")]
+    assert np.linalg.norm(solution.pairs[0].baseline_enu[-1] - solution.pairs[0].truth_enu[-1]) < 10.0  # type: ignore[index]
+
+
+def test_what_cannot_be_done_is_told(noisy: NavigationProblem) -> None:
+    bare = replace(noisy, vehicles=tuple(replace(v, imu=None) for v in noisy.vehicles))
+    with pytest.raises(InputError, match="vehicle leader: the relative filter needs its attitude and specific force"):
+        solve(bare, "relative")
+    with pytest.raises(InputError, match="no measurements called carrier; there are code, doppler"):
+        Configuration(kinds=("carrier",))
+    alone = replace(noisy, vehicles=noisy.vehicles[:1], links=(), ranges=())
+    with pytest.raises(InputError, match="two moving vehicles or anchors; there is leader"):
+        prepare(alone, own_motions(alone, {}), {})
+
+
+def test_times_beside_the_epochs_are_left_out() -> None:
+    epochs = np.array([0.0, 0.5, 1.0])
+    assert flight._epoch_of(np.array([-0.1, 0.0, 0.501, 0.7, 1.0, 2.0]), epochs).tolist() == [-1, 0, 1, -1, 2, -1]
