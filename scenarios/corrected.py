@@ -9,21 +9,26 @@ over deviations d from the prediction (O3), in coordinates whitened by the poste
 follow. Rows are as the filter linearised them. Of a filter that takes its rows as they are, the posterior is where that is least,
 and a search can at best return to it; one that weighs rows or noise (huber, rackf, sage-husa, iae, rae, forgetting) is taken back
 to the noise as stated. Where a covariance is not sound, the posterior stays.
+
+Updates of the relative filter are judged and corrected as they are, distances and all.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from factorgraph.filters.correctors import Case, Searched
 from factorgraph.filters.methods import FILTERS
 from factorgraph.filters.recursive import Recursive
+from factorgraph.filters.relative import method as relative
+from factorgraph.filters.relative.filtering import Update
+from factorgraph.filters.relative.method import RelativeFilter
 from factorgraph.registry import RECURSIVE
-from factorgraph.types import Array, BoolArray
-from scenarios.methods import CORRECTED, SMOOTHED
-from swarm.corrector import Corrector, CorrectorSettings
+from factorgraph.types import Array, BoolArray, IntArray
+from scenarios.methods import CORRECTED, RELATIVE, SMOOTHED
+from swarm.corrector import Corrected, Corrector, CorrectorSettings
 from swarm.judgement import Rule, judge
 from swarm.snapshot import Snapshot
 
@@ -61,8 +66,46 @@ def _snapshot(case: Case, rows: BoolArray, dof: float | None) -> Snapshot:
     return Snapshot(np.zeros(len(case.x_post)), case.P_prior, case.x_post, case.P_post, e, np.eye(len(e)), H, dof=dof)
 
 
-def create(name: str, settings: CorrectorSettings = SETTINGS, integers: bool | None = None) -> Recursive:
+@dataclass(frozen=True, slots=True)
+class RelativeCorrection:
+    """Judges and corrects the updates of a relative filter, all draws from one generator.
+
+    A reference that stands on the ground has states without variance: they are left as they are. Scales and biases of ranges
+    are those predicted.
+    """
+
+    corrector: Corrector
+    rng: np.random.Generator
+
+    def __call__(self, update: Update) -> Corrected:
+        free = np.flatnonzero(np.diag(update.P_prior) > 0.0)
+        found = self.corrector(relative_snapshot(update, free), self.rng)
+        x, P = update.x_post.copy(), update.P_post.copy()
+        x[free], P[np.ix_(free, free)] = found.x, found.P
+        return replace(found, x=x, P=P)
+
+
+def relative_snapshot(update: Update, free: IntArray) -> Snapshot:
+    """An update of the relative filter with the states `free`, which are those with variance."""
+    rows, x, square = update.rows, update.x_prior, np.ix_(free, free)
+    z = rows.z.copy()
+    z[rows.norm_rows] -= rows.H[rows.norm_rows] @ x
+    return Snapshot(
+        x[free], update.P_prior[square], update.x_post[free], update.P_post[square], z, rows.R, update.H[:, free],
+        rows.norm_rows, rows.norm_D[:, :, free] if len(rows.norm_rows) else rows.norm_D, rows.norm_d, rows.scales(x),
+    )  # fmt: skip
+
+
+def create(name: str, settings: CorrectorSettings = SETTINGS, integers: bool | None = None) -> Recursive | RelativeFilter:
     """A method of the family FILTER-SEARCH; `integers` as in `Recursive`. Raises KeyError for an unknown filter."""
+    if name.startswith(f"{RELATIVE}-"):
+        search = name.removeprefix(f"{RELATIVE}-")
+        return replace(
+            relative.RELATIVE,
+            name=name,
+            summary=f"{relative.RELATIVE.summary}, corrected by {search}",
+            correct=lambda: RelativeCorrection(Corrector(settings, search), np.random.default_rng(SEED)),
+        )
     alone = name.removesuffix(SMOOTHED)
     plain, search = next((f, alone[len(f) + 1 :]) for f in sorted(FILTERS, key=len, reverse=True) if alone.startswith(f"{f}-"))
     method = FILTERS[plain]
@@ -70,7 +113,7 @@ def create(name: str, settings: CorrectorSettings = SETTINGS, integers: bool | N
     return Recursive(name, f"{RECURSIVE[plain]}, corrected by {search}", corrected, name.endswith(SMOOTHED), integers)
 
 
-def __getattr__(name: str) -> Recursive:
+def __getattr__(name: str) -> Recursive | RelativeFilter:
     if name not in CORRECTED.names:
         raise AttributeError(f"module {__name__} has no attribute {name}")
     return create(name)

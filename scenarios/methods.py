@@ -1,6 +1,7 @@
 """Estimators by name: those of `factorgraph.registry`, and any recursive filter with a search that corrects it.
 
-FILTER-SEARCH such as eskf-tdo or ukf-gauss-newton is made by `corrected`; FILTER-SEARCH-rts is smoothed.
+FILTER-SEARCH such as eskf-tdo, ukf-gauss-newton or relative-tdo is made by `corrected`; FILTER-SEARCH-rts is smoothed, but for
+the relative filter, which has no smoother.
 """
 
 from __future__ import annotations
@@ -14,10 +15,14 @@ from factorgraph.registry import RECURSIVE, Method, Progress
 from factorgraph.solution import Solution
 
 SMOOTHED = "-rts"
+RELATIVE = "relative"
 SEARCHES = ("tdo", "pso", "ga", "cma-es", "de", "gauss-newton")
 CORRECTED = Family(
     "FILTER-SEARCH",
-    tuple(f"{name}-{search}{end}" for name in RECURSIVE for search in SEARCHES for end in ("", SMOOTHED)),
+    (
+        *(f"{name}-{search}{end}" for name in RECURSIVE for search in SEARCHES for end in ("", SMOOTHED)),
+        *(f"{RELATIVE}-{search}" for search in SEARCHES),
+    ),
     "scenarios.corrected",
     f"a filter that a search corrects where its innovations do not fit, such as eskf-tdo: {', '.join(SEARCHES)}",
 )

@@ -19,6 +19,7 @@ from factorgraph.problem import Link, NavigationProblem, Settings, Vehicle
 from factorgraph.registry import solve
 from factorgraph.solution import Fix, PairSolution, Solution, Status, VehicleSolution
 from factorgraph.types import Array, BoolArray
+from scenarios import methods
 from scenarios.flights import load
 from scenarios.flights.rtklib_pos import read_pos
 from tests.helpers import shared_data, wheel_file
@@ -282,6 +283,15 @@ def test_quadcopters_relative_to_each_other_with_anchors() -> None:
         assert rmse(path.r_n - path.truth.r_n[nearest]) <= 0.30
     nis = solution.diagnostics.nis.sum() / solution.diagnostics.nis_dof.sum()
     assert 0.5 < nis < 1.2
+
+
+def test_quadcopters_by_the_relative_filter_with_and_without_a_corrector() -> None:
+    plain, corrected = (methods.solve(problem_of("miluv"), name) for name in ("relative", "relative-tdo"))
+    for a, b in zip(plain.pairs, corrected.pairs, strict=True):
+        assert rmse(pair_error(a)) <= 1.2, f"{a.reference}-{a.rover}"
+        np.testing.assert_allclose(b.baseline_enu, a.baseline_enu, atol=0.1)  # O3's least is the filter's own posterior
+    assert "replaced by the corrector" in corrected.diagnostics.notes[-1]
+    assert plain.diagnostics.nis.sum() / plain.diagnostics.nis_dof.sum() < 2.0
 
 
 def test_quadcopters_relative_to_each_other_without_anchors() -> None:

@@ -5,6 +5,7 @@ Timelines show one seed, the first; everything else is of all seeds.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -47,6 +48,7 @@ COLOURS = dict(zip(COMPARED, (*CYCLE, TRUTH_COLOUR), strict=True))
 METHOD_COLOURS = {"tdo": CYCLE[0], "pso": CYCLE[1], "ga": CYCLE[2]}
 FEW_SEEDS = 10
 CDF_POINTS = 300
+LABEL_WIDTH = 14
 CURVE_POINTS = 1200
 LOWEST_EXCESS = 1e-12  # where the axis of the searches begins
 Quantity = tuple[str, str, str, str]  # letter of the metrics, unit, name of the norms, word
@@ -177,7 +179,7 @@ def _axis_bars(
     rows: Sequence[Row], metric: str, unit: str, y_title: str, title: str, paper: Mapping[str, Sequence[float]]
 ) -> Chart:
     """Bars of every axis, a group for each estimator."""
-    titles = [title_of(row.name) for row in rows]
+    titles = [_label(row) for row in rows]
     traces: list[Trace] = []
     for i, axis in enumerate(AXES):
         found = [(name, s) for name, row in zip(titles, rows, strict=True) if (s := row.of(f"{metric}_{axis}")) is not None]
@@ -197,6 +199,11 @@ def _axis_bars(
         "yaxis": {"title": {"text": y_title}, "rangemode": "tozero"},
     }
     return Chart(title, legend_once(traces), layout, 400)
+
+
+def _label(row: Row) -> str:
+    """An estimator below a group of bars, in short lines."""
+    return "<br>".join(textwrap.wrap(title_of(row.name), LABEL_WIDTH))
 
 
 def _cdf_chart(rows: Sequence[Row], quantity: Quantity, title: str) -> Chart:
@@ -315,7 +322,7 @@ def _window_section(summary: Summary) -> Section:
         traces = []
         for part, name, colour in (("manoeuvre", "at manoeuvres", ALERT_COLOUR), ("quiet", "elsewhere", TRUTH_COLOUR)):
             found = [(row, s) for row in rows if (s := row.of(f"{letter}_{part}")) is not None]
-            traces.append(bars([title_of(row.name) for row, _ in found], [s for _, s in found], colour, name))
+            traces.append(bars([_label(row) for row, _ in found], [s for _, s in found], colour, name))
         layout = {
             "barmode": "group",
             "hovermode": "closest",

@@ -171,8 +171,8 @@ def fly(scene: ahrs_tdo_filters.Scene, seed: int, names: Sequence[str], seconds:
 
 def _truth(formation: Formation) -> tuple[Array, Array]:
     found = truth_of(formation, LEADER, FOLLOWER)
-    assert found is not None
-    return found
+    assert found is not None and found[1] is not None
+    return found[0], found[1]
 
 
 def _judge(track: RelativeTrack, truth: tuple[Array, Array]) -> dict[str, Any]:

@@ -155,6 +155,8 @@ def _best(summary: Summary) -> Iterator[Claim]:
         verdict = together(positive(negated(d.difference)) for d in found.values())
         ours = "; ".join(f"against {METHODS[other]} {shown(d.percent, '%', '.1f')}" for other, d in found.items())
         others = _other_readings(summary, metric)
+        if not summary.rows[PUBLISHED].is_consistent:
+            others.append("The covariance of AHRS+TDO is not consistent.")
         yield Claim(id, text, paper, ours, verdict, " ".join([*(f"{_told(d)}" for d in found.values()), *others]))
 
 
@@ -408,7 +410,7 @@ def _bound_words(summary: Summary, i: int, found: Statistic, aim: float, unit: s
     if summary.bound is None:
         return "The bound was not computed."
     bound = float(summary.bound[i])
-    beyond = ", so that the aim is out of reach for the mean of many seeds" if bound > aim else ""
+    beyond = ", more than the aim" if bound > aim else ""
     ratio = plain(found.value / bound, ".2f")
     return f"The bound of an estimator of the whole flight is {plain(bound)} {unit}{beyond}; found is {ratio} times that."
 

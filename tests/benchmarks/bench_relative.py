@@ -71,7 +71,7 @@ def main() -> None:
     print(f"{'formations':12s} {'vehicles':>9s} {'prepare s':>10s} {'filter s':>9s} {'RMS of all pairs m':>20s}")
     for ranges in ("all", "ring"):
         for n in (2, 4, 6, 8, 10):
-            formation, vehicles_s, measurements_s = prepared(n, ranges)  # type: ignore[arg-type]
+            formation, vehicles_s, measurements_s = prepared(n, ranges)
             track, spent = timed(formation, CONFIGURATIONS["without absolute differences"])
             error = float(np.mean(pair_errors(formation, track)))
             print(f"{ranges:12s} {n:9d} {vehicles_s + measurements_s:10.2f} {spent:9.2f} {error:20.3f}")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from factorgraph.errors import InputError
-from factorgraph.filters.relative import flight, rows
+from factorgraph.filters.relative import flight, rows, start
 from factorgraph.filters.relative.flight import Configuration, Formation, prepare, truth_of
 from factorgraph.filters.relative.motion import position, velocity
 from factorgraph.filters.relative.own import own_motions
@@ -147,3 +147,41 @@ def test_what_cannot_be_done_is_told(noisy: NavigationProblem) -> None:
 def test_times_beside_the_epochs_are_left_out() -> None:
     epochs = np.array([0.0, 0.5, 1.0])
     assert flight._epoch_of(np.array([-0.1, 0.0, 0.501, 0.7, 1.0, 2.0]), epochs).tolist() == [-1, 0, 1, -1, 2, -1]
+
+
+ANCHORS = np.array([[5.0, 5.0, 2.0], [5.0, -5.0, 2.1], [-5.0, -5.0, 1.9], [-5.0, 5.0, 2.2]])
+
+
+def standing(true: Array, sigma: float, n_epochs: int = 6) -> dict[int, list[rows.RangeRow]]:
+    """Ranges from anchors of the ground to two followers that stand at `true` (2, 3), and between these."""
+    rng = np.random.default_rng(4)
+    out: dict[int, list[rows.RangeRow]] = {}
+    for k in range(n_epochs):
+        found = [
+            rows.RangeRow(0, i + 1, -a, float(np.linalg.norm(true[i] - a) + sigma * rng.normal()), 0.1, "a")
+            for i in (0, 1)
+            for a in ANCHORS
+        ]
+        found.append(rows.RangeRow(1, 2, np.zeros(3), float(np.linalg.norm(true[1] - true[0])), 0.1, "b"))
+        out[k] = found
+    return out
+
+
+def test_followers_are_placed_by_ranges_and_the_first_height_tells_up_from_down() -> None:
+    t = np.arange(6.0)
+    names = (flight.GROUND, "a", "b")
+    for up in (0.2, 3.8):  # below and above the anchors
+        true = np.array([[1.0, 2.0, up], [-2.0, 0.5, up]])
+        heights = {8: [rows.HeightRow(i, np.array([0.0, 0.0, 1.0]), up + 0.5, 0.1, "h") for i in (0, 1)]}
+        x, P = start.placed(standing(true, 0.05), heights, t, names, rest_s=10.0)
+        found = np.array([x[position(0)], x[position(1)]])
+        np.testing.assert_allclose(found, true, atol=0.4)
+        sigma = np.sqrt(np.diag(P)[[3, 4, 5]])
+        assert np.all(np.abs(found[0] - true[0]) < 4 * sigma) and np.linalg.eigvalsh(P).min() > 0
+        assert x[velocity(0)] == pytest.approx(np.zeros(3)) and P[0, 0] == pytest.approx(start.SPEED_MPS[0] ** 2)
+
+
+def test_too_few_ranges_place_nothing() -> None:
+    few = {0: [rows.RangeRow(0, 1, -ANCHORS[0], 5.0, 0.1, "a")]}
+    with pytest.raises(InputError, match=r"vehicle a: 1 ranges until 3\.0 s, too few to place it"):
+        start.placed(few, {}, np.zeros(1), (flight.GROUND, "a"), None)

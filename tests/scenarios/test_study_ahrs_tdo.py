@@ -90,6 +90,7 @@ def test_a_world_like_the_published_one_reproduces_its_claims() -> None:
     assert all(said[f"search-{m}"].verdict is Verdict.NOT_TESTED for m in ("pso", "ga"))
     assert said["nees-ahrs"].verdict is Verdict.REPRODUCED
     assert said["worse-ahrs-tdo-o1"].verdict is Verdict.NOT_REPRODUCED  # it is better
+    assert "not consistent" not in said["best-position"].evidence
     best = summary.best
     assert best is not None and best.name == PUBLISHED
     assert said["aim-r-x"].verdict is Verdict.NOT_REPRODUCED and "0.279" in said["aim-r-x"].ours
@@ -131,7 +132,10 @@ def test_optimistic_filters_are_marked() -> None:
     found = results(0.0, ahrs=(np.ones(3), np.ones(3)))
     for arrays in found.values():
         arrays["ahrs/nees"][:] *= 4.0
+    found |= {Job("x", {"part": "published", "seed": 1}): {"t_s": T, **flown(PUBLISHED, np.ones(3), np.ones(3), 9)}}
+    next(reversed(found.values()))[f"{PUBLISHED}/nees"][:] *= 0.1
     summary, said = judged(found)
+    assert "not consistent" in said["best-position"].evidence
     assert not summary.rows["ahrs"].is_consistent and said["nees-ahrs"].verdict is Verdict.NOT_REPRODUCED
     assert any("‡" in row[0] for table in tables(summary) for row in table.rows)
 

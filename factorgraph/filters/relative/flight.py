@@ -57,6 +57,7 @@ from factorgraph.measurements import Tag
 from factorgraph.models.double_differences import PairEpochs, pair_epochs
 from factorgraph.models.receivers import Receiver
 from factorgraph.problem import NavigationProblem, RangeModel, Vehicle
+from factorgraph.sampling import interpolate
 from factorgraph.types import Array, IntArray
 
 GROUND = "the ground"  # as a reference
@@ -366,18 +367,23 @@ def _epoch_of(t_s: Array, epochs_s: Array) -> IntArray:
     return np.where(np.abs(epochs_s[near] - t_s) <= MATCH_S, near, -1)
 
 
-def truth_of(formation: Formation, reference: str, rover: str) -> tuple[Array, Array] | None:
-    """True position and velocity (K, 3), ECEF, of rover less reference at the epochs, NaN outside the truth; None without one."""
-    out_r, out_v = np.zeros((2, len(formation.t_s), 3))
-    for name, sign in ((rover, 1.0), (reference, -1.0)):
-        truth = formation.problem.vehicle(name).truth
-        if truth is None or truth.v_n is None:
-            return None
-        at = nearest_epoch(truth.t_s, formation.t_s)
-        for out, values in ((out_r, truth.r_n), (out_v, truth.v_n)):
-            out += sign * np.where((at >= 0)[:, None], values[np.maximum(at, 0)], np.nan)
-    to_e = formation.problem.frame.rotate_to_ecef
-    return to_e(out_r), to_e(out_v)
+def truth_of(formation: Formation, reference: str, rover: str) -> tuple[Array, Array | None] | None:
+    """True position and, where known, velocity (K, 3), ECEF, of rover less reference at the epochs; NaN outside the truth.
+
+    None where one of them has none.
+    """
+    problem, t_s = formation.problem, formation.t_s
+    a, b = problem.vehicle(reference).truth, problem.vehicle(rover).truth
+    if a is None or b is None:
+        return None
+    known = (t_s >= max(a.t_s[0], b.t_s[0]) - 1e-6) & (t_s <= min(a.t_s[-1], b.t_s[-1]) + 1e-6)
+
+    def difference(x_a: Array, x_b: Array) -> Array:
+        between = interpolate(t_s, b.t_s, x_b) - interpolate(t_s, a.t_s, x_a)
+        return problem.frame.rotate_to_ecef(np.where(known[:, None], between, np.nan))
+
+    v = None if a.v_n is None or b.v_n is None else difference(a.v_n, b.v_n)
+    return difference(a.r_n, b.r_n), v
 
 
 def attitude_at(t_s: Array, q_nb: Array, at_s: Array) -> Array:

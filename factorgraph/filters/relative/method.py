@@ -8,6 +8,7 @@ ground. Innovations stand in for residuals.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,12 +39,12 @@ from factorgraph.types import Array, IntArray
 
 @dataclass(frozen=True, slots=True)
 class RelativeFilter:
-    """A relative filter of one configuration; `correct` judges and replaces its updates."""
+    """A relative filter of one configuration; what `correct` makes for a run judges and replaces its updates."""
 
     name: str
     summary: str
     configuration: Configuration = field(default_factory=Configuration)
-    correct: Correct | None = None
+    correct: Callable[[], Correct] | None = None
 
     def solve(self, problem: NavigationProblem, progress: Progress) -> Solution:
         """Raises InputError where vehicles have no IMU, or no attitude can be had."""
@@ -62,7 +63,8 @@ class RelativeFilter:
         formation = prepare(problem, motions, rx)
         stage("measurements", 0.5)
         innovations = Innovations(formation)
-        track = formation.run(self.configuration, self.correct, innovations.add)
+        correct = None if self.correct is None else self.correct()
+        track = formation.run(self.configuration, correct, innovations.add)
         stage("relative filter", 1.0)
         return solution(formation, track, innovations.table(problem.settings.outlier_sigma), self.name, spent)
 
@@ -146,7 +148,7 @@ def _pair(formation: Formation, track: RelativeTrack, link: Link) -> PairSolutio
     return PairSolution(
         link.reference, link.rover, track.t_s, _turned(C, r), _turned(C, v), both @ P @ np.swapaxes(both, 1, 2),
         np.full(n, Fix.NONE.value), np.full(n, np.nan), _satellites(formation, {a, b}),
-        None if true is None else _turned(C, true[0]), None if true is None else _turned(C, true[1]),
+        None if true is None else _turned(C, true[0]), None if true is None or true[1] is None else _turned(C, true[1]),
     )  # fmt: skip
 
 
