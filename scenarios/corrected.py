@@ -80,13 +80,16 @@ class RelativeCorrection:
     def __call__(self, update: Update) -> Corrected:
         free = np.flatnonzero(np.diag(update.P_prior) > 0.0)
         found = self.corrector(relative_snapshot(update, free), self.rng)
+        if not found.triggered:
+            return replace(found, x=update.x_post, P=update.P_post)
         x, P = update.x_post.copy(), update.P_post.copy()
         x[free], P[np.ix_(free, free)] = found.x, found.P
         return replace(found, x=x, P=P)
 
 
-def relative_snapshot(update: Update, free: IntArray) -> Snapshot:
-    """An update of the relative filter with the states `free`, which are those with variance."""
+def relative_snapshot(update: Update, free: IntArray | None = None) -> Snapshot:
+    """An update of the relative filter, of the states `free` where only some have variance."""
+    free = np.arange(len(update.x_prior)) if free is None else free
     rows, x, square = update.rows, update.x_prior, np.ix_(free, free)
     z = rows.z.copy()
     z[rows.norm_rows] -= rows.H[rows.norm_rows] @ x

@@ -7,7 +7,7 @@ the flight with seeds TUNING_SEEDS (`relnav study ahrs-tdo` repeats it) and are 
 
 Scenes: as published; accelerometers a hundred times better; one range in OUTLIER_EVERY longer by OUTLIER_M, of which no filter
 is told; every vehicle's own attitude filter on IMU and magnetometer in place of an attitude system of given errors; the vehicles'
-own filters with code alone and their accelerometer errors taken off, as printed; Doppler told to be worthless.
+own filters with code alone and their accelerometer errors taken off, as printed.
 
 Source: Lu et al. (2024); spec ahrs_tdo.md, sections 2.5, 2.6 and 2.8.
 """
@@ -21,28 +21,28 @@ from typing import Literal
 
 import numpy as np
 
-from factorgraph.filters.relative.filtering import Correct, Replaced, Update
+from factorgraph.filters.relative.filtering import Correct, Update
 from factorgraph.filters.relative.flight import Configuration, Formation, prepare
+from factorgraph.filters.relative.method import HONEST
 from factorgraph.filters.relative.own import OwnSettings, own_motions
 from factorgraph.filters.relative.rows import KINDS, RANGE
 from factorgraph.models.receivers import receivers
-from factorgraph.problem import NavigationProblem, Vehicle
+from factorgraph.problem import NavigationProblem
 from factorgraph.types import Array
+from scenarios.corrected import RelativeCorrection, relative_snapshot
 from scenarios.published import ahrs_tdo
 from scenarios.simulate.streams import Streams
 from swarm.corrector import GAUSS_NEWTON, Corrector, CorrectorSettings, Optimiser, posed
 from swarm.judgement import Rule, trigger_rates
 from swarm.objective import Which
 from swarm.result import SwarmResult
-from swarm.snapshot import Snapshot
 
-Scene = Literal["published", "0.1mg", "outliers", "own-attitude", "own-code", "own-code-0.1mg", "no-doppler"]
+Scene = Literal["published", "0.1mg", "outliers", "own-attitude", "own-code", "own-code-0.1mg"]
 TUNING_SEEDS = (1001, 1002, 1003, 1004, 1005)
 WALKS = {"velocity": 0.2, "acceleration": 0.1}  # m/s per sqrt(s), m/s^2 per sqrt(s); see above
 CA_CV = "ca"  # the better of both
 EVALUATIONS, MEMBERS = 36_000, 30  # of a correction: those of TDO with 800 iterations
 OUTLIER_M, OUTLIER_EVERY = 3.0, 20
-WORTHLESS_MPS = 1e3
 RULE_TRIALS = 5000
 UWB_M, JUMP_MPS, PUSH_MPS2 = 3.0, 1.0, 2.0  # mismatches that rules are asked to see
 TUNED: dict[str, object] = {
@@ -114,8 +114,9 @@ FILTERS = {
         "AHRS, attitude errors as states, UWB scale known, without absolute differences",
         replace(_without("position", "velocity"), range_scale=SCALE, coloured=True),
     ),
+    "relative": Filter("relative, as `relnav smooth --method relative`: as before, UWB scale estimated", HONEST),
     "no-abs-tdo-o1": Filter("AHRS+TDO, O1, without absolute differences", _without("position", "velocity"), _correction("O1")),
-    "no-doppler": Filter("AHRS, Doppler without weight", scene="no-doppler"),
+    "no-doppler": Filter("AHRS without Doppler", _without("doppler")),
     "ca-0.1mg": Filter("0.1 mg: CA", CA, scene="0.1mg"),
     "ahrs-0.1mg": Filter("0.1 mg: AHRS", scene="0.1mg"),
     "ahrs-tdo-o1-0.1mg": Filter("0.1 mg: AHRS+TDO, O1", correction=_correction("O1"), scene="0.1mg"),
@@ -146,8 +147,6 @@ def problem(scene: Scene, seed: int) -> NavigationProblem:
     flight = ahrs_tdo.simulate_flight(seed, accel, magnetometers=scene == "own-attitude").problem
     if scene == "own-attitude":
         return replace(flight, vehicles=tuple(replace(v, attitudes=()) for v in flight.vehicles))
-    if scene == "no-doppler":
-        return replace(flight, vehicles=tuple(_without_doppler(v) for v in flight.vehicles))
     if scene != "outliers":
         return flight
     rng = Streams(seed)("range outliers")
@@ -158,11 +157,6 @@ def problem(scene: Scene, seed: int) -> NavigationProblem:
     return replace(flight, ranges=tuple(ranges))
 
 
-def _without_doppler(vehicle: Vehicle) -> Vehicle:
-    assert vehicle.gnss is not None
-    return replace(vehicle, gnss=replace(vehicle.gnss, noise=replace(vehicle.gnss.noise, doppler_mps=WORTHLESS_MPS)))
-
-
 def formation(scene: Scene, seed: int) -> Formation:
     """The flight of a scene with what each vehicle tells of itself, ready for relative filters."""
     flight = problem(scene, seed)
@@ -171,30 +165,16 @@ def formation(scene: Scene, seed: int) -> Formation:
     return prepare(flight, own_motions(flight, rx, settings), rx)
 
 
-def snapshot(update: Update) -> Snapshot:
-    """An update of the relative filter as judgements and corrections see it."""
-    rows = update.rows
-    return Snapshot(
-        update.x_prior, update.P_prior, update.x_post, update.P_post, rows.z, rows.R, update.H,
-        rows.norm_rows, rows.norm_D, rows.norm_d, rows.norm_scale,
-    )  # fmt: skip
-
-
 def corrector(one: Filter, rng: np.random.Generator) -> Correct | None:
     """The correction of a filter's updates, all draws from one generator; None without one."""
     if one.correction is None:
         return None
-    correct = Corrector(one.correction.settings, Optimiser(one.correction.method, EVALUATIONS, MEMBERS))
-
-    def of(update: Update) -> Replaced:
-        return correct(snapshot(update), rng)
-
-    return of
+    return RelativeCorrection(Corrector(one.correction.settings, Optimiser(one.correction.method, EVALUATIONS, MEMBERS)), rng)
 
 
 def searched(update: Update, which: Which, methods: Sequence[str], seed: int) -> tuple[float, dict[str, SwarmResult]]:
     """Gauss-Newton's minimum of an objective, and what every method makes of it."""
-    within, cost = posed(CorrectorSettings(objective=which), snapshot(update))
+    within, cost = posed(CorrectorSettings(objective=which), relative_snapshot(update))
     least = Optimiser(GAUSS_NEWTON)(cost, within, np.random.default_rng(seed)).cost
     runs = {
         m: Optimiser(m, EVALUATIONS, MEMBERS)(cost, within, np.random.default_rng([seed, zlib.crc32(m.encode())]))
@@ -205,7 +185,7 @@ def searched(update: Update, which: Which, methods: Sequence[str], seed: int) ->
 
 def rates(update: Update, rng: np.random.Generator) -> Mapping[str, Mapping[str, float]]:
     """How often each rule triggers at an update, without and with what it should see (spec ahrs_tdo.md, check 8)."""
-    u = snapshot(update)
+    u = relative_snapshot(update)
     kind = update.rows.kind
     zero, uwb = np.zeros(u.m), np.where(kind == RANGE, UWB_M, 0.0)
     jump, push = np.zeros(u.n), np.zeros(u.n)  # of the state against the prediction

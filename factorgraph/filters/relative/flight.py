@@ -149,7 +149,7 @@ class Formation:
         """Sources in the order of the publication's rows: double differences, absolute differences, ranges."""
         sources: list[Source] = []
         if self.links and {"code", "doppler"} & set(c.kinds):
-            sources.append(CodeAndRate(self.links, self.noise, self.places, self.problem.frame, self.t_s, self.names, n))
+            sources.append(CodeAndRate(self.links, self.noise, self.places, self.problem.frame, self.t_s, self.names, n, c.kinds))
         if "position" in c.kinds:
             sources.append(AbsoluteDifferences(*self.absolute, self.names, n, c.absolute_factor))
         if "range" in c.kinds:

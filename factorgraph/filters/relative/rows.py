@@ -16,7 +16,7 @@ Source: Lu et al. (2024), eqs. 32 to 35; spec ahrs_tdo.md, section 2.4, errata E
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -134,8 +134,9 @@ class CodeAndRate:
 
     def __init__(
         self, data: dict[int, PairEpochs], noise: dict[int, PairNoise], places: Places, frame: LocalFrame,
-        epochs_s: Array, names: tuple[str, ...], n: int,
+        epochs_s: Array, names: tuple[str, ...], n: int, kinds: Collection[str] = ("code", "doppler"),
     ) -> None:  # fmt: skip
+        self.kinds = [KINDS.index(kind) for kind in ("code", "doppler") if kind in kinds]
         self.links = {i: _Link.of(pair, noise[i], frame, epochs_s) for i, pair in data.items()}
         self.places, self.epochs_s, self.names, self.n = places, epochs_s, names, n
         self.satellites = sorted({name for pair in data.values() for name in pair.satellites})
@@ -148,14 +149,11 @@ class CodeAndRate:
             return None
         parts = [self._of_link(i, link, j, k, order, x) for i, link, j, order in found]
         code, rate, H_code, H_rate = (np.concatenate(column) for column in zip(*parts, strict=True))
-        m = len(code)
-        R = np.zeros((2 * m, 2 * m))
-        R[:m, :m] = self._noise([(link, link.code_m, j, order) for _, link, j, order in found])
-        R[m:, m:] = self._noise([(link, link.doppler_mps, j, order) for _, link, j, order in found])
+        R_code = self._noise([(link, link.code_m, j, order) for _, link, j, order in found])
+        R_rate = self._noise([(link, link.doppler_mps, j, order) for _, link, j, order in found])
         labels = tuple(label for i, link, _, order in found for label in self._labels(i, link, order))
-        return Rows(
-            np.concatenate([code, rate]), np.concatenate([H_code, H_rate]), R, np.repeat([CODE, DOPPLER], m), labels + labels
-        )
+        both = {CODE: (code, H_code, R_code), DOPPLER: (rate, H_rate, R_rate)}
+        return stacked([Rows(*both[kind], np.full(len(labels), kind), labels) for kind in self.kinds])
 
     def _labels(self, i: int, link: _Link, order: IntArray) -> list[str]:
         satellites = link.pair.satellites
