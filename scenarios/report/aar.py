@@ -15,7 +15,7 @@ import numpy as np
 
 from factorgraph.types import Array, BoolArray
 from scenarios.published.aar import DATA_SETS
-from scenarios.report.chart import ENU, Chart, Panel, log_axis, plane_chart, time_chart
+from scenarios.report.chart import ENU, Chart, Panel, log_axis, plane_chart, shaded, time_chart
 from scenarios.report.frame import Card, Page, Section, write_page
 from scenarios.report.series import (
     ALERT_COLOUR,
@@ -30,22 +30,18 @@ from scenarios.report.series import (
     translucent,
 )
 from scenarios.report.signals import SKY_POINTS, sky_chart
-from scenarios.report.tables import folded, paragraph, table, text
+from scenarios.report.tables import document_table, folded, paragraph, table, text
+from scenarios.report.verdicts import DIGITS, bars, claim_sections, prose, published, verdict_cards
 from scenarios.studies.aar_claims import (
     MIN_SEEDS,
     PAPER_ALGORITHMS,
     PAPER_RATIO,
     PAPER_RMS,
-    Claim,
-    Verdict,
     claims,
-    plain,
     robust_advantages,
 )
 from scenarios.studies.aar_record import (
     ROBUST_LEAD,
-    Table,
-    count_verdicts,
     detail_tables,
     graph_note,
     overview_tables,
@@ -55,27 +51,25 @@ from scenarios.studies.aar_summary import (
     DEFAULT,
     FILTERS,
     GRAPH,
-    NAN,
     RATIO_CAP,
     RATIO_THRESHOLD,
     SCHEMES,
     Curve,
     JobKey,
-    Statistic,
     Summary,
     algorithm_name,
     algorithms,
     windows,
 )
+from scenarios.studies.statistics import NAN, Statistic
+from scenarios.studies.verdicts import Claim, plain, seed_count
 
 Results = Mapping[JobKey, Mapping[str, Array]]
 
 COLOURS = dict(zip((*SCHEMES, "g"), (CYCLE[5], CYCLE[4], CYCLE[2], CYCLE[0], CYCLE[3], CYCLE[6]), strict=True))
-BADGES = {Verdict.REPRODUCED: "good", Verdict.PARTLY: "bad", Verdict.NOT_REPRODUCED: "stop", Verdict.NOT_TESTED: "idle"}
 RATIO_FIGURES = {1: 5, 2: 9, 3: 10, 4: 11}
 BASELINE_FIGURES = {1: 13, 2: 16, 3: 19, 4: 22}
 SMALLEST_M, SMALLEST_MPS = 1e-3, 1e-4  # where logarithmic axes of errors begin
-DIGITS = 4
 UNKNOWN = Statistic(NAN, NAN, NAN, NAN, NAN, 0)
 FAULT_TEXTS = {
     1: "Original data.",
@@ -125,7 +119,7 @@ def study_page(summary: Summary, results: Results, parameters: Mapping[str, obje
             _table_section(summary, parameters),
         ],
         cards=_cards(summary, judged),
-        badge=f"{n_seeds} seeds" if n_seeds != 1 else "1 seed",
+        badge=seed_count(n_seeds),
         badge_is_good=not few and n_seeds > 0,
         lines=(
             "Two-stage adaptive relative navigation: the numbers of the publication beside those found here; means over the "
@@ -140,12 +134,7 @@ def study_page(summary: Summary, results: Results, parameters: Mapping[str, obje
 
 
 def _cards(summary: Summary, judged: Sequence[Claim]) -> list[Card]:
-    def share(is_check: bool) -> tuple[str, str]:
-        mine = [claim for claim in judged if claim.is_check == is_check]
-        good = sum(claim.verdict is Verdict.REPRODUCED for claim in mine)
-        return f"{good} of {len(mine)}", count_verdicts(judged, is_check).partition(", ")[2]
-
-    cards = [Card("Claims reproduced", *share(False)), Card("Further checks met", *share(True))]
+    cards = verdict_cards(judged)
     for digit, data in (("3", 2), ("4", 2), ("5", 4)):
         found = {name: summary.statistic("p_se", digit + main, data) for main, name in FILTERS.items()}
         if any(found.values()):
@@ -167,7 +156,7 @@ def shown_cm(found: Statistic | None) -> str:
 
 
 def _overview(summary: Summary) -> list[Section]:
-    html = "".join(f"<h3>{text(t.title)}</h3>{_table(t)}" for t in overview_tables(summary))
+    html = "".join(f"<h3>{text(t.title)}</h3>{document_table(t)}" for t in overview_tables(summary))
     advantages = robust_advantages(summary)
     if advantages:
         listed = "".join(f"<li>{text(sentence)}</li>" for sentence in advantages)
@@ -176,26 +165,10 @@ def _overview(summary: Summary) -> list[Section]:
     return [Section("overview", "Success rates and ratios", "Overview", _ratio_means(summary), html, absent)]
 
 
-def _table(t: Table) -> str:
-    return table(t.head, t.rows, t.n_text) + (paragraph(t.note) if t.note else "")
-
-
 def _readings_section(summary: Summary) -> Section:
     found = readings(summary)
     lead = "The publication leaves much open, and some of it cannot be met as printed. What is read or done otherwise:"
-    return Section("readings", found.title, "Readings", html=_prose(found) + paragraph(found.note), lead=lead)
-
-
-def _prose(found: Table) -> str:
-    """A table of sentences, whose cells wrap."""
-    rows = ["".join(f"<td>{text(cell)}</td>" for cell in row) for row in found.rows]
-    return _wrapped(found.head, rows)
-
-
-def _wrapped(head: Sequence[str], rows: Sequence[str]) -> str:
-    header = "".join(f"<th>{text(name)}</th>" for name in head)
-    body = "".join(f"<tr>{row}</tr>" for row in rows)
-    return f'<div class="table wrap" tabindex="0"><table><thead><tr>{header}</tr></thead><tbody>{body}</tbody></table></div>'
+    return Section("readings", found.title, "Readings", html=prose(found.head, found.rows) + paragraph(found.note), lead=lead)
 
 
 def _ratio_means(summary: Summary) -> list[Chart]:
@@ -208,9 +181,9 @@ def _ratio_means(summary: Summary) -> list[Chart]:
     for main, name in FILTERS.items():
         found = [summary.statistic("ratio_mean", digit + main, data) for data, digit in groups]
         colours = [COLOURS[digit] if main == "b" else translucent(COLOURS[digit], 0.45) for _, digit in groups]
-        traces.append(_bars(x, [s or UNKNOWN for s in found], colours, name))
-    published = np.array([PAPER_RATIO[digit].get(data, np.nan) for data, digit in groups])
-    traces.append(_published(x, numbers(published)))
+        traces.append(bars(x, [s or UNKNOWN for s in found], colours, name))
+    paper = np.array([PAPER_RATIO[digit].get(data, np.nan) for data, digit in groups])
+    traces.append(published(x, numbers(paper)))
     layout = {
         "xaxis": {"type": "multicategory"},
         "yaxis": {"title": {"text": "mean ratio"}, "rangemode": "tozero"},
@@ -226,57 +199,13 @@ def _either(summary: Summary, digit: str, data: int) -> bool:
     return any(summary.statistic("ratio_mean", digit + main, data) for main in FILTERS)
 
 
-def _published(x: object, y: object) -> Trace:
-    """Marks of the publication's numbers."""
-    marker = {"symbol": "diamond-open", "size": 9, "color": ALERT_COLOUR, "line": {"width": 2}}
-    trace: Trace = {"type": "scatter", "mode": "markers", "name": "published", "x": x, "y": y, "marker": marker}
-    return trace | {"hovertemplate": "published %{y}<extra></extra>"}
-
-
-def _bars(x: object, values: Sequence[Statistic], colours: Sequence[str], name: str, scale: float = 1.0) -> Trace:
-    """Bars with the interval of each value."""
-    y = scale * np.array([v.value for v in values])
-    above = scale * np.array([v.upper for v in values]) - y
-    below = y - scale * np.array([v.lower for v in values])
-    whiskers = {
-        "type": "data",
-        "symmetric": False,
-        "array": numbers(above, DIGITS),
-        "arrayminus": numbers(below, DIGITS),
-        "thickness": 1.3,
-    }
-    return {
-        "type": "bar",
-        "name": name,
-        "x": x,
-        "y": numbers(y, DIGITS),
-        "marker": {"color": list(colours)},
-        "error_y": whiskers | {"color": TRUTH_COLOUR},
-        "hovertemplate": "%{x}: %{y:.4~g}<extra></extra>",
-    }
-
-
 def _claim_sections(judged: Sequence[Claim]) -> list[Section]:
-    paper, checks = ([c for c in judged if c.is_check == is_check] for is_check in (False, True))
     lead = (
         "A published number counts as reproduced where it lies within the span of the seeds or near their mean, a comparison "
         "where the 95 % interval of the paired difference lies on the right side of zero. The publication speaks of schemes: "
         "they are judged beside the SKF and beside the AKF, and what holds with one of them alone counts as partly."
     )
-    return [
-        Section("claims", "Claims of the publication", "Claims", html=_claim_table(paper, "published"), lead=lead),
-        Section("checks", "Further checks", "Checks", html=_claim_table(checks, "")),
-    ]
-
-
-def _claim_table(found: Sequence[Claim], paper: str) -> str:
-    head = ["claim" if paper else "check", *([paper] if paper else []), "here", "verdict", "evidence"]
-    rows = []
-    for claim in found:
-        badge = f'<span class="badge {BADGES[claim.verdict]}">{text(claim.word)}</span>'
-        cells = [text(claim.text), *([text(claim.paper)] if paper else []), text(claim.ours), badge, text(claim.evidence)]
-        rows.append("".join(f"<td>{cell}</td>" for cell in cells))
-    return _wrapped(head, rows)
+    return claim_sections(judged, lead)
 
 
 # the scenario
@@ -418,20 +347,7 @@ def _curve(name: str, t_s: Array, y: Array, colour: str, unit: str, **style: Any
 
 def _shaded(chart: Chart, t_s: Array, faulted: BoolArray) -> Chart:
     """The chart with the fault windows marked over all panels."""
-    shapes = [
-        {
-            "type": "rect",
-            "xref": "x",
-            "yref": "paper",
-            "x0": float(t_s[w][0]) - 0.5,
-            "x1": float(t_s[w][-1]) + 0.5,
-            "y0": 0,
-            "y1": 1,
-        }
-        | {"fillcolor": translucent(ALERT_COLOUR, 0.16), "line": {"width": 0}, "layer": "below"}
-        for w in windows(faulted)
-    ]
-    return replace(chart, layout=chart.layout | {"shapes": shapes}) if shapes else chart
+    return shaded(chart, ((float(t_s[w][0]) - 0.5, float(t_s[w][-1]) + 0.5) for w in windows(faulted)))
 
 
 def _ratio_timeline(arrays: Mapping[str, Array], t_s: Array, faulted: BoolArray, data: int) -> Chart | str:
@@ -513,11 +429,11 @@ def _rms_bars(summary: Summary, data: int, figure: int) -> list[Chart | str]:
             continue
         names = [algorithm_name(row.cell.algorithm) for row in mine]
         values = [row.statistics[metric] for row in mine]
-        traces = [_bars(names, values, [_colour(row.cell.algorithm) for row in mine], "here")]
-        published = {algorithm_name(a): bounds[index] for (a, d), bounds in PAPER_RMS.items() if d == data}
-        marked = {name: value for name, value in published.items() if name in names}
+        traces = [bars(names, values, [_colour(row.cell.algorithm) for row in mine], "here")]
+        paper = {algorithm_name(a): bounds[index] for (a, d), bounds in PAPER_RMS.items() if d == data}
+        marked = {name: value for name, value in paper.items() if name in names}
         if marked:
-            traces.append(_published(list(marked), list(marked.values())))
+            traces.append(published(list(marked), list(marked.values())))
         heights = np.array([v for s in values for v in (s.value, s.lower, s.upper)] + list(marked.values()))
         axis = {"title": {"text": f"RMS [{unit}]"}} | _roomy(heights)
         layout = {"xaxis": {"type": "category", "tickangle": -45}, "yaxis": axis, "hovermode": "closest"}
@@ -567,7 +483,7 @@ def _sweep_chart(curve: Curve, caption: str, title: str, is_log: bool) -> Chart:
 
 
 def _table_section(summary: Summary, parameters: Mapping[str, object]) -> Section:
-    parts = [folded(t.title, _table(t)) for t in detail_tables(summary)]
+    parts = [folded(t.title, document_table(t)) for t in detail_tables(summary)]
     if parameters:
         rows = [(name, str(value)) for name, value in parameters.items()]
         parts.append(folded("Parameters", table(("parameter", "value"), rows, 2)))

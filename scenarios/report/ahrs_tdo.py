@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from factorgraph.consistency import average_nees
 from scenarios.metrics import cdf
 from scenarios.published.ahrs_tdo import MANOEUVRES
 from scenarios.published.ahrs_tdo_filters import CA_CV
-from scenarios.report.chart import Chart, Panel, log_axis, time_chart
+from scenarios.report.chart import Chart, Panel, log_axis, shaded, time_chart
 from scenarios.report.frame import Card, Page, Section, write_page
 from scenarios.report.series import (
     ALERT_COLOUR,
@@ -28,19 +27,17 @@ from scenarios.report.series import (
     line,
     numbers,
     thin,
-    translucent,
 )
-from scenarios.report.tables import paragraph, table, text
-from scenarios.report.verdicts import bars, claim_table, prose, published
-from scenarios.studies.aar_claims import Claim, Verdict, plain
-from scenarios.studies.aar_record import count_verdicts
-from scenarios.studies.aar_summary import NEES_PROB
-from scenarios.studies.ahrs_tdo import GRID, OTHERS
+from scenarios.report.tables import document_table, text
+from scenarios.report.verdicts import bars, claim_sections, prose, published, verdict_cards
+from scenarios.studies.ahrs_tdo import GRID, OTHERS, parameters
 from scenarios.studies.ahrs_tdo_claims import METHODS, PAPER_POSITION, PAPER_VELOCITY
-from scenarios.studies.ahrs_tdo_record import HOW, parameter_table, readings_table, tables
+from scenarios.studies.ahrs_tdo_record import HOW, readings_table, tables
 from scenarios.studies.ahrs_tdo_summary import AXES, PLAIN, PUBLISHED, RECOVERED_S, Row, Search, Summary, estimators, title_of
-from scenarios.studies.document import Table
+from scenarios.studies.document import parameter_table, parameter_texts
+from scenarios.studies.statistics import NEES_PROB
 from scenarios.studies.study import Arrays, Job, Results
+from scenarios.studies.verdicts import Claim, plain, seed_count
 
 MAIN = (CA_CV, PLAIN, PUBLISHED)
 COMPARED = (PUBLISHED, CA_CV, PLAIN, "graph", "eskf", "moving-horizon", "ahrs-tdo-o2", "ahrs-nis-o3", "no-abs")
@@ -94,7 +91,7 @@ def study_page(summary: Summary, judged: Sequence[Claim], first: Mapping[str, Ar
             _table_section(summary),
         ],
         cards=_cards(summary, judged),
-        badge=f"{summary.n_seeds} seed{'s' if summary.n_seeds != 1 else ''}",
+        badge=seed_count(summary.n_seeds),
         badge_is_good=not few,
         lines=(text(HOW), f"Made by <code>{text(command)}</code>"),
         reasons=[f"{summary.n_seeds} seeds are few: intervals of this run are wide."] if few else [],
@@ -109,11 +106,7 @@ def _shown(summary: Summary, names: Sequence[str]) -> list[Row]:
 
 
 def _cards(summary: Summary, judged: Sequence[Claim]) -> list[Card]:
-    cards = []
-    for name, is_check in (("Claims reproduced", False), ("Further checks met", True)):
-        mine = [c for c in judged if c.is_check == is_check]
-        good = sum(c.verdict is Verdict.REPRODUCED for c in mine)
-        cards.append(Card(name, f"{good} of {len(mine)}", count_verdicts(judged, is_check).partition(", ")[2]))
+    cards = verdict_cards(judged)
     for other in (PLAIN, CA_CV):
         found = [summary.compare(metric, other, PUBLISHED) for metric in ("r_3d", "v_3d")]
         if all(d is not None for d in found):
@@ -129,15 +122,11 @@ def _cards(summary: Summary, judged: Sequence[Claim]) -> list[Card]:
 
 
 def _claim_sections(judged: Sequence[Claim]) -> list[Section]:
-    paper, checks = ([c for c in judged if c.is_check == is_check] for is_check in (False, True))
     lead = (
         "A published number counts as reproduced where it lies within the span of the seeds or near their mean, a comparison "
         "where the 95 % interval of the paired difference lies on the right side of zero."
     )
-    return [
-        Section("claims", "Claims of the publication", "Claims", html=claim_table(paper, "published"), lead=lead),
-        Section("checks", "Further checks", "Checks", html=claim_table(checks, "")),
-    ]
+    return claim_sections(judged, lead)
 
 
 def _readings_section() -> Section:
@@ -162,7 +151,7 @@ def _error_section(
         _std_chart(rows, quantity, f"Figure {std_of} of the paper: standard deviation of the {word} error per axis"),
     ]
     found = tables(summary)[0 if letter == "r" else 1]
-    return Section(word, title, word.capitalize(), charts, _html(found))
+    return Section(word, title, word.capitalize(), charts, document_table(found))
 
 
 def _rmse_chart(rows: Sequence[Row], quantity: Quantity, paper: Mapping[str, Sequence[float]], title: str) -> Chart:
@@ -246,10 +235,11 @@ def _timeline_section(first: Mapping[str, Arrays], quantity: Quantity, figure: i
             traces.append(curve | {"line": {"color": COLOURS[name], "width": 1.4}, "hovertemplate": f"%{{y:.4~f}} {unit}"})
         traces += _sigma(first, i + 3 * (word == "velocity"))
         charts.append(
-            _marked(
+            shaded(
                 time_chart(
                     f"Figure {figure + i} of the paper: {word} error {axis.upper()}", [Panel(f"{axis.upper()} [{unit}]", traces)]
-                )
+                ),
+                MANOEUVRES,
             )
         )
     lead = f"The first seed. Shaded: ±3σ of {title_of(PLAIN)}; bars: the follower is pushed aside."
@@ -266,18 +256,6 @@ def _sigma(first: Mapping[str, Arrays], column: int) -> list[Trace]:
     return [] if area is None else [area]
 
 
-def _marked(chart: Chart) -> Chart:
-    """The chart with the manoeuvres marked."""
-    shapes = [
-        {
-            "type": "rect", "xref": "x", "yref": "paper", "x0": a, "x1": b, "y0": 0, "y1": 1,
-            "fillcolor": translucent(ALERT_COLOUR, 0.18), "line": {"width": 0}, "layer": "below",
-        }
-        for a, b in MANOEUVRES
-    ]  # fmt: skip
-    return replace(chart, layout=chart.layout | {"shapes": shapes})
-
-
 # searches
 
 
@@ -288,7 +266,7 @@ def _search_section(summary: Summary) -> Section:
         "finds. Medians over updates and seeds, shaded the quartiles of TDO."
     )
     found = next((t for t in tables(summary) if t.title.startswith("Searches")), None)
-    html = _html(found) if found else ""
+    html = document_table(found) if found else ""
     return Section("searches", "Searches", "Searches", charts, html, "Searches were not run.", lead)
 
 
@@ -351,15 +329,12 @@ def _consistency_section(summary: Summary) -> Section:
         style = {"color": TRUTH_COLOUR, "width": 1.2, "dash": "dash"}
         traces.append(line(rows[0].t_s, edge, np.zeros(len(edge), np.int64), name="99 % band", mode="lines", line=style))
     panel = Panel("mean NEES", traces, log_axis(np.concatenate(values)), 1.6)
-    chart = _marked(time_chart("Mean NEES over the seeds of relative position and velocity", [panel]))
+    chart = shaded(time_chart("Mean NEES over the seeds of relative position and velocity", [panel]), MANOEUVRES)
     found_table = next(t for t in tables(summary) if t.title == "Consistency")
-    return Section("consistency", "Consistency", "Consistency", [chart], _html(found_table))
-
-
-def _html(found: Table) -> str:
-    return table(found.head, found.rows, found.n_text) + (paragraph(found.note) if found.note else "")
+    return Section("consistency", "Consistency", "Consistency", [chart], document_table(found_table))
 
 
 def _table_section(summary: Summary) -> Section:
-    html = "".join(f"<h3>{text(t.title)}</h3>{_html(t)}" for t in (*tables(summary), parameter_table()))
+    found = (*tables(summary), parameter_table(parameter_texts(parameters())))
+    html = "".join(f"<h3>{text(t.title)}</h3>{document_table(t)}" for t in found)
     return Section("tables", "Tables", "Tables", html=html)

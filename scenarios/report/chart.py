@@ -5,18 +5,15 @@ Colours of text, grid and ground are left to the page, which follows the reader'
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from factorgraph.solution import Fix
 from factorgraph.types import Array
-from scenarios.report.series import (
-    Trace,
-    legend_once,
-)
+from scenarios.report.series import ALERT_COLOUR, Trace, legend_once, translucent
 
 ENU = ("east", "north", "up")
 TIME_TITLE = "time since t0 [s]"
@@ -67,6 +64,18 @@ def time_chart(title: str, panels: Sequence[Panel], note: str = "") -> Chart:
         layout["xaxis"]["range"] = [min(times), max(times)]
     height_px = 95 + round(150 * sum(panel.share for panel in panels)) + (50 if len(panels) == 1 else 0)
     return Chart(title, legend_once(data), layout, height_px, note, is_time=True)
+
+
+def shaded(chart: Chart, spans: Iterable[tuple[float, float]]) -> Chart:
+    """The chart with spans of time marked over all panels."""
+    shapes = [
+        {
+            "type": "rect", "xref": "x", "yref": "paper", "x0": start, "x1": end, "y0": 0, "y1": 1,
+            "fillcolor": translucent(ALERT_COLOUR, 0.16), "line": {"width": 0}, "layer": "below",
+        }
+        for start, end in spans
+    ]  # fmt: skip
+    return replace(chart, layout=chart.layout | {"shapes": shapes}) if shapes else chart
 
 
 def log_axis(values: Array) -> dict[str, Any]:

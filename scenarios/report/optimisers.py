@@ -17,7 +17,7 @@ from scenarios.metrics_ranks import Ranking, cliques
 from scenarios.report.chart import Chart, log_axis
 from scenarios.report.frame import Card, Page, Section, write_page
 from scenarios.report.series import CYCLE, TRUTH_COLOUR, Trace, band, line, numbers, plot_text
-from scenarios.report.tables import paragraph, table, text
+from scenarios.report.tables import document_table, table, text
 from scenarios.studies.document import Table
 from scenarios.studies.optimisers import KINDS, grid
 from scenarios.studies.optimisers_record import (
@@ -34,6 +34,7 @@ from scenarios.studies.optimisers_record import (
     verdict_table,
 )
 from scenarios.studies.optimisers_summary import SUBJECT, Problem, Summary
+from scenarios.studies.verdicts import seed_count
 
 EVALS_TITLE = "evaluations"
 HALF_PX = 330
@@ -62,7 +63,7 @@ def study_page(summary: Summary, command: str) -> Page:
             _table_section(summary),
         ],
         cards=_cards(summary),
-        badge=f"{summary.n_seeds} seeds" if summary.n_seeds != 1 else "1 seed",
+        badge=seed_count(summary.n_seeds),
         badge_is_good=not few,
         lines=(text(HOW), f"Made by <code>{text(command)}</code>"),
         reasons=[reason] if few else [],
@@ -105,12 +106,8 @@ def _banded(methods: Sequence[str]) -> str:
 # sections
 
 
-def _html(found: Table) -> str:
-    return table(found.head, found.rows, found.n_text) + (paragraph(found.note) if found.note else "")
-
-
 def _titled(found: Table) -> str:
-    return f"<h3>{text(found.title)}</h3>{_html(found)}" if found.rows else ""
+    return f"<h3>{text(found.title)}</h3>{document_table(found)}" if found.rows else ""
 
 
 def _verdict_section(summary: Summary) -> Section:
@@ -118,13 +115,13 @@ def _verdict_section(summary: Summary) -> Section:
     html = ""
     if found.rows:
         listed = "".join(f"<li>{text(sentence)}</li>" for sentence in sentences(summary))
-        html = f"<ul>{listed}</ul>{_html(found)}{_titled(speed_table(summary))}"
+        html = f"<ul>{listed}</ul>{document_table(found)}{_titled(speed_table(summary))}"
     return Section("verdicts", found.title, "Verdicts", html=html, absent=f"{SUBJECT} was not run beside another method.")
 
 
 def _rank_section(summary: Summary) -> Section:
     charts = [rank_chart(KINDS[kind].title, found, summary.methods) for kind, found in summary.rankings.items()]
-    html = _html(rank_table(summary)) if charts else ""
+    html = document_table(rank_table(summary)) if charts else ""
     lead = "Methods joined by a bar cannot be told apart; the ruler is the critical difference. The best stands on the left."
     return Section("ranks", "Mean ranks", "Ranks", charts, html, "There is nothing to rank with a single method.", lead)
 
@@ -132,7 +129,7 @@ def _rank_section(summary: Summary) -> Section:
 def _success_section(summary: Summary) -> Section:
     charts = [_success_chart(summary, kind) for kind in summary.kinds]
     lead = "Share of runs that are solved after so many evaluations."
-    return Section("success", "Success", "Success", charts, _html(success_table(summary)), lead=lead)
+    return Section("success", "Success", "Success", charts, document_table(success_table(summary)), lead=lead)
 
 
 def _convergence_section(summary: Summary, kind: str) -> Section:
@@ -150,7 +147,7 @@ def _origin_section(summary: Summary) -> Section:
         "Full: the optimum lies at the origin of the coordinates. Dashed: function and box moved away together, so that nothing "
         "but the coordinates' origin has changed."
     )
-    html = _html(contrast_table(summary)) if summary.contrasts else ""
+    html = document_table(contrast_table(summary)) if summary.contrasts else ""
     return Section("origin", "Does the place of the origin matter?", "Origin", charts, html, "Not run.", lead, open_charts=6)
 
 

@@ -14,6 +14,7 @@ from factorgraph.solution import AmbiguityTable, ParameterEstimate, ResidualTabl
 from scenarios.metrics import ErrorSeries, SummaryRow, statistics, summary_rows
 from scenarios.report.chart import UNITS
 from scenarios.report.series import normalised
+from scenarios.studies.document import Table
 
 ROW_LIMIT = 400
 OUTLIER_LIMIT = 200
@@ -37,6 +38,11 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], n_text: int = 1) -
         "<tr>" + "".join(f"<td{_align(i, n_text)}>{text(c)}</td>" for i, c in enumerate(row)) + "</tr>" for row in rows
     )
     return f'<div class="table" tabindex="0"><table><thead><tr>{header}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def document_table(found: Table) -> str:
+    """A table of a study with its note."""
+    return table(found.head, found.rows, found.n_text) + (paragraph(found.note) if found.note else "")
 
 
 def paragraph(words: str) -> str:

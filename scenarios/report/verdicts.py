@@ -1,4 +1,4 @@
-"""What pages about a publication have in common: verdicts on its claims, and bars beside its numbers."""
+"""What pages about a publication have in common: cards and tables of verdicts on its claims, bars beside its numbers."""
 
 from __future__ import annotations
 
@@ -6,13 +6,33 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from scenarios.report.frame import Card, Section
 from scenarios.report.series import ALERT_COLOUR, TRUTH_COLOUR, Trace, numbers
 from scenarios.report.tables import text
-from scenarios.studies.aar_claims import Claim, Verdict
-from scenarios.studies.aar_summary import Statistic
+from scenarios.studies.statistics import Statistic
+from scenarios.studies.verdicts import Claim, Verdict, count_verdicts
 
 BADGES = {Verdict.REPRODUCED: "good", Verdict.PARTLY: "bad", Verdict.NOT_REPRODUCED: "stop", Verdict.NOT_TESTED: "idle"}
 DIGITS = 4
+
+
+def verdict_cards(judged: Sequence[Claim]) -> list[Card]:
+    """How many claims are reproduced, how many checks met."""
+    cards = []
+    for name, is_check in (("Claims reproduced", False), ("Further checks met", True)):
+        mine = [claim for claim in judged if claim.is_check == is_check]
+        good = sum(claim.verdict is Verdict.REPRODUCED for claim in mine)
+        cards.append(Card(name, f"{good} of {len(mine)}", count_verdicts(judged, is_check).partition(", ")[2]))
+    return cards
+
+
+def claim_sections(judged: Sequence[Claim], lead: str) -> list[Section]:
+    """Claims with `lead` before them, and checks."""
+    paper, checks = ([c for c in judged if c.is_check == is_check] for is_check in (False, True))
+    return [
+        Section("claims", "Claims of the publication", "Claims", html=claim_table(paper, "published"), lead=lead),
+        Section("checks", "Further checks", "Checks", html=claim_table(checks, "")),
+    ]
 
 
 def claim_table(found: Sequence[Claim], paper: str) -> str:

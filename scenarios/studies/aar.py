@@ -123,7 +123,8 @@ class AarStudy:
     def finish(self, results: Results[Job], folder: Path, options: argparse.Namespace) -> Outcome:
         from scenarios.report.aar import write_study
         from scenarios.studies.aar_claims import claims
-        from scenarios.studies.aar_record import count_verdicts, write_record, write_table
+        from scenarios.studies.aar_record import write_record, write_table
+        from scenarios.studies.verdicts import count_verdicts
 
         cut, command = ByDataSet(results), _command(options)
         summary = summarise(cut)

@@ -1,25 +1,15 @@
 """The publication's claims about aerial refuelling, each with our number and a verdict that follows from it.
 
-How verdicts follow, N the number of the publication (which comes from one run on unknown satellites):
-
-    a number           reproduced where N lies within the span of our seeds or near our mean, partly where not far from it
-    "at most N"        reproduced where the whole interval of our mean is at most N, partly up to twice N
-    "A better than B"  reproduced where the 95 % interval of the paired difference lies on the right side of zero, partly
-                       where only the mean does
-    "A at least B"     reproduced where that interval is nowhere below zero, partly where it reaches zero
-    several at once    reproduced where all are, not reproduced where none is, else partly; what was not run is left out
+How verdicts follow stands in `scenarios.studies.verdicts`; the publication's numbers come from one run on unknown satellites.
 
 The publication speaks of schemes without a main filter. What it says of one is judged beside the standard main filter
 (SKF) and beside the adaptive one (AKF): reproduced where it holds with both, partly where it holds with one or where only
-one was run. A claim of which nothing was run is not tested. Further checks, which are not claims of the publication,
-follow the same rules and are called met. Source: Wu and others 2022: table 2, figures 5 to 24, section 3.
+one was run. A claim of which nothing was run is not tested. Source: Wu and others 2022: table 2, figures 5 to 24, section 3.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from enum import Enum
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -36,9 +26,26 @@ from scenarios.studies.aar_summary import (
     Cell,
     Difference,
     Row,
-    Statistic,
     Summary,
     algorithm_name,
+)
+from scenarios.studies.statistics import Statistic
+from scenarios.studies.verdicts import (
+    CHECK_WORDS,
+    Claim,
+    Verdict,
+    at_least_zero,
+    at_most,
+    holds,
+    near,
+    negated,
+    plain,
+    positive,
+    seed_count,
+    shifted,
+    shown,
+    together,
+    untested,
 )
 
 PAPER_SUCCESS = {  # table 2, P_SE in percent
@@ -83,38 +90,6 @@ SEES_LITTLE_PCT = 5.0
 NOTHING_PCT = 1e-3  # rounding of an ADOP
 
 
-class Verdict(Enum):
-    REPRODUCED = "reproduced"
-    PARTLY = "partly"
-    NOT_REPRODUCED = "not reproduced"
-    NOT_TESTED = "not tested"
-
-
-CHECK_WORDS = {
-    Verdict.REPRODUCED: "met",
-    Verdict.PARTLY: "partly met",
-    Verdict.NOT_REPRODUCED: "not met",
-    Verdict.NOT_TESTED: "not tested",
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Claim:
-    """One statement, what the publication and we find, and the verdict."""
-
-    id: str
-    text: str
-    paper: str  # value and source
-    ours: str  # value with its interval
-    verdict: Verdict
-    evidence: str
-    is_check: bool = False  # a further check, not a claim of the publication
-
-    @property
-    def word(self) -> str:
-        return CHECK_WORDS[self.verdict] if self.is_check else self.verdict.value
-
-
 def claims(summary: Summary) -> list[Claim]:
     """Every claim, judged by the numbers of the summary."""
     return [
@@ -131,91 +106,7 @@ def claims(summary: Summary) -> list[Claim]:
     ]
 
 
-# judging
-
-
-def near(found: Statistic, value: float, close: float, far: float) -> Verdict:
-    """A published number against ours; `close` and `far` are distances from our mean."""
-    off = abs(found.value - value)
-    if found.low <= value <= found.high or off <= close:
-        return Verdict.REPRODUCED
-    return Verdict.PARTLY if off <= far else Verdict.NOT_REPRODUCED
-
-
-def at_most(found: Statistic, bound: float) -> Verdict:
-    """Whether a mean is at most a bound; a single seed is its own interval."""
-    top = found.upper if np.isfinite(found.upper) else found.value
-    if top <= bound:
-        return Verdict.REPRODUCED
-    return Verdict.PARTLY if found.value <= 2 * bound else Verdict.NOT_REPRODUCED
-
-
-def positive(found: Statistic) -> Verdict:
-    """Whether a difference is above zero."""
-    if found.lower > 0:
-        return Verdict.REPRODUCED
-    return Verdict.PARTLY if found.value > 0 else Verdict.NOT_REPRODUCED
-
-
-def at_least_zero(found: Statistic) -> Verdict:
-    """Whether a difference is nowhere below zero; a single seed is its own interval."""
-    bottom, top = (bound if np.isfinite(bound) else found.value for bound in (found.lower, found.upper))
-    if bottom >= 0:
-        return Verdict.REPRODUCED
-    return Verdict.PARTLY if top >= 0 else Verdict.NOT_REPRODUCED
-
-
-def shifted(found: Statistic, by: float) -> Statistic:
-    """A statistic of x + by from that of x."""
-    value, lower, upper, low, high = (v + by for v in (found.value, found.lower, found.upper, found.low, found.high))
-    return Statistic(value, lower, upper, low, high, found.n)
-
-
-def negated(found: Statistic) -> Statistic:
-    """A statistic of -x from that of x."""
-    return Statistic(-found.value, -found.upper, -found.lower, -found.high, -found.low, found.n)
-
-
-def holds(condition: bool) -> Verdict:
-    return Verdict.REPRODUCED if condition else Verdict.NOT_REPRODUCED
-
-
-def together(parts: Iterable[Verdict]) -> Verdict:
-    """The verdict of several parts that are claimed at once."""
-    tested = {part for part in parts if part is not Verdict.NOT_TESTED}
-    if not tested:
-        return Verdict.NOT_TESTED
-    return tested.pop() if len(tested) == 1 else Verdict.PARTLY
-
-
 # words
-
-
-def shown(found: Statistic | None, unit: str = "", form: str = ".3g", scale: float = 1.0) -> str:
-    """A mean with its interval, in words."""
-    if found is None or not np.isfinite(found.value):
-        return "–"
-    value = f"{plain(scale * found.value, form)}{' ' if unit else ''}{unit}"
-    if not np.isfinite(found.lower):
-        return value
-    return f"{value} ({plain(scale * found.lower, form)} to {plain(scale * found.upper, form)})"
-
-
-def plain(value: float, form: str = ".3g") -> str:
-    """A number by a format, without an exponent where it is large, with a true minus sign."""
-    if not np.isfinite(value):
-        return "–"
-    text = format(value, form)
-    text = f"{float(text):.0f}" if "e+" in text else text
-    return "−" + text[1:] if text.startswith("-") and float(text) != 0 else text.removeprefix("-")
-
-
-def _untested(id: str, text: str, paper: str, missing: str, is_check: bool = False) -> Claim:
-    return Claim(id, text, paper, "–", Verdict.NOT_TESTED, f"Not run: {missing}.", is_check)
-
-
-def _seeds(n: int) -> str:
-    return f"{n} seed" if n == 1 else f"{n} seeds"
 
 
 def _span(found: Statistic, unit: str = "", form: str = ".3g") -> str:
@@ -231,7 +122,7 @@ def _missing(names: Sequence[str], data: int | None = None) -> str:
 
 def _gap(difference: Difference, unit: str = "", form: str = ".3g") -> str:
     d = difference.difference
-    wins = f"better in {difference.better} of {_seeds(d.n)}"
+    wins = f"better in {difference.better} of {seed_count(d.n)}"
     first, second = (algorithm_name(cell.algorithm) for cell in (difference.first, difference.second))
     return f"{second} less {first}: {shown(d, unit, form)}, {wins}"
 
@@ -253,7 +144,7 @@ def _by_filter(
     """A claim about schemes from what `judge` finds for "a" (SKF) and "b" (AKF), None where it was not run."""
     found = {name: part for letter, name in FILTERS.items() if (part := judge(letter)) is not None}
     if not found:
-        return _untested(id, text, paper, missing, is_check)
+        return untested(id, text, paper, missing, is_check)
     verdict = together(part.verdict for part in found.values())
     if len(found) < len(FILTERS) and verdict is Verdict.REPRODUCED:
         verdict = Verdict.PARTLY
@@ -406,7 +297,7 @@ def _gain(summary: Summary, metric: str, first: str, second: str, value: float) 
         verdict = near(gain, value, 0.15 * value, 0.5 * value)
         if verdict is Verdict.NOT_REPRODUCED and positive(gain) is Verdict.REPRODUCED:
             verdict = Verdict.PARTLY  # right direction, other size
-        return Part(verdict, shown(gain, "%"), f"{_span(gain, '%')}; better in {difference.better} of {_seeds(gain.n)}.")
+        return Part(verdict, shown(gain, "%"), f"{_span(gain, '%')}; better in {difference.better} of {seed_count(gain.n)}.")
 
     id = f"gain-{metric.replace('_', '-')}-{SCHEMES[first]}"
     what = {"ratio_mean": "Mean ratio", "p_se": "Success rate"}[metric]
@@ -482,7 +373,7 @@ def _main_filters(summary: Summary) -> list[Claim]:
     over = row.statistics.get("velocity_spike") if row else None
     found = []
     if row is None or over is None:
-        found.append(_untested(spike, spike_text, paper, "3a on Data 1"))
+        found.append(untested(spike, spike_text, paper, "3a on Data 1"))
     else:
         each = ", ".join(f"{plain(at)} s {plain(s.value)}" for at, s in row.at_times("velocity_manoeuvre"))
         evidence = f"RMS within 5 s in m/s: {each}; elsewhere {shown(row.statistics['velocity_elsewhere'])}."
@@ -497,7 +388,7 @@ def _main_filters(summary: Summary) -> list[Claim]:
             )
         )
     if difference is None:
-        found.append(_untested(damp, damp_text, paper, "3a and 3b on Data 1"))
+        found.append(untested(damp, damp_text, paper, "3a and 3b on Data 1"))
     else:
         found.append(Claim(damp, damp_text, paper, _change(difference), _reduced(difference), _velocities(summary, difference)))
     for metric, value in PAPER_FILTER_GAIN:
@@ -534,7 +425,7 @@ def _filter_gain(summary: Summary, metric: str, value: float) -> Claim:
     paper = f"−{value} % (section 3.2.2)"
     difference = _filter_difference(summary, metric)
     if difference is None:
-        return _untested(id, text, paper, "3a and 3b on Data 1")
+        return untested(id, text, paper, "3a and 3b on Data 1")
     verdict = _reduced(difference)
     if verdict is Verdict.REPRODUCED and not -difference.percent.high <= value <= -difference.percent.low:
         verdict = Verdict.PARTLY  # right direction, other size
@@ -574,7 +465,7 @@ def _bounded(
 ) -> Claim:
     row = summary.row(algorithm, data)
     if row is None or any(metric not in row.statistics for metric in metrics):
-        return _untested(id, text, paper, _missing([algorithm_name(algorithm)], data))
+        return untested(id, text, paper, _missing([algorithm_name(algorithm)], data))
     baseline, velocity = (row.statistics[metric] for metric in metrics)
     fixed = row.statistics.get(metrics[0] + "_fixed")
     evidence = f"Worst seed {plain(baseline.high)} m, {plain(velocity.high)} m/s; fixed epochs alone: {shown(fixed, 'm')}."
@@ -599,7 +490,7 @@ def _code_slope(summary: Summary, id: str = "figure-7", is_check: bool = False) 
     slopes = {label: summary.sweep.get(f"slope {label}") for label in ("WLS", "EKF", "IEKF")}
     known = [gap for gap in gaps if gap is not None]
     if len(known) < 2:
-        return _untested(id, text, paper, "the sweep of the code σ", is_check)
+        return untested(id, text, paper, "the sweep of the code σ", is_check)
     ours = ", ".join(f"{label} {plain(s.value)}" for label, s in slopes.items() if s is not None) + " cycles/m"
     evidence = f"Slope of WLS less that of EKF {shown(known[0])}, of IEKF {shown(known[1])} cycles/m."
     return Claim(id, text, paper, ours, together(positive(gap) for gap in known), evidence, is_check)
@@ -610,7 +501,7 @@ def _ins_limit(summary: Summary) -> Claim:
     paper = "crossing at about 1.5 m (Fig. 8)"
     curve = summary.curve("adop_ins_excess")
     if curve is None:
-        return _untested(id, text, paper, "the sweep of the INS σ")
+        return untested(id, text, paper, "the sweep of the INS σ")
     x, (excess, _, _) = np.array(curve.x), curve.of("IEKF")
     within, beyond = x <= PAPER_INS_LIMIT_M, x > PAPER_INS_LIMIT_M
     parts = [
@@ -656,7 +547,7 @@ def _worse_beyond(summary: Summary) -> Claim:
     paper = "beyond 1.5 m (Fig. 8)"
     excess = summary.sweep.get("largest excess of IEKF")
     if excess is None:
-        return _untested(id, text, paper, "the sweep of the INS σ")
+        return untested(id, text, paper, "the sweep of the INS σ")
     evidence = "Largest excess of the ADOP of IEKF over that of EKF; information that is weighted consistently never enlarges it."
     bias = _bias_limit(summary)
     if bias is not None:
@@ -686,7 +577,7 @@ def _sees_wrong_fixes(summary: Summary) -> Claim:
     cases = ((a, data) for data in DATA_SETS for a in ("1b", "2b", "3b"))
     case = next((c for c in cases if summary.statistic("adapted_wrong", *c) is not None), None)
     if case is None:
-        return _untested(id, text, paper, "an algorithm with the adaptive filter that fixes wrongly")
+        return untested(id, text, paper, "an algorithm with the adaptive filter that fixes wrongly")
     wrong, right = (summary.statistic(f"adapted_{which}", *case) for which in ("wrong", "right"))
     assert wrong is not None
     floor = right.value if right is not None else 0.0
@@ -729,7 +620,7 @@ def _graph(summary: Summary) -> list[Claim]:
         id, text = f"graph-{data}", f"The factor graph on Data {data}: P_SE ≥ {GRAPH_SUCCESS_PCT} %, baseline RMS ≤ 1.5 cm"
         paper = "–"
         if row is None or "baseline_rms" not in row.statistics:
-            found.append(_untested(id, text, paper, _missing(["the factor graph"], data), True))
+            found.append(untested(id, text, paper, _missing(["the factor graph"], data), True))
             continue
         success, rms = row.statistics["p_se"], row.statistics["baseline_rms"]
         parts = [at_most(shifted(negated(success), 100.0), 100 - GRAPH_SUCCESS_PCT), at_most(rms, GRAPH_RMS_M)]
@@ -766,7 +657,7 @@ def _disjoint_orders(summary: Summary) -> Claim:
         parts = [holds(a.upper < b.lower) for found in (s, r) for a, b in pairwise(found)]
         ours = ", ".join(shown(x, "%", ".1f") for x in s)
         verdict = together([*parts, holds(n >= MIN_SEEDS)])
-        return Part(verdict, ours, f"{_seeds(n)}; mean ratios {', '.join(shown(x) for x in r)}.")
+        return Part(verdict, ours, f"{seed_count(n)}; mean ratios {', '.join(shown(x) for x in r)}.")
 
     text = f"Data 1, at least {MIN_SEEDS} seeds: P_SE of WLS < EKF < IEKF with disjoint intervals, mean ratio in the same order"
     return _by_filter("disjoint-orders", text, "–", _missing(["WLS", "EKF", "IEKF"], 1), judge, True)
@@ -806,14 +697,14 @@ def _precision(summary: Summary) -> list[Claim]:
     id, text = "adop-never-worse", "ADOP of IEKF at most that of EKF whatever the σ of the INS position"
     excess = summary.sweep.get("largest excess of IEKF")
     if excess is None:
-        found.append(_untested(id, text, "–", "the sweep of the INS σ", True))
+        found.append(untested(id, text, "–", "the sweep of the INS σ", True))
     else:
         evidence = f"Largest excess over all seeds and σ {plain(excess.high)} %."
         found.append(Claim(id, text, "–", shown(excess, "%"), holds(excess.high <= NOTHING_PCT), evidence, True))
     id, text = "biased-ins", "With a biased INS prior the success rate of IEKF falls below that of EKF, at a reported bias"
     bias = _bias_limit(summary)
     if bias is None:
-        return [*found, _untested(id, text, "–", "the sweep of the bias", True)]
+        return [*found, untested(id, text, "–", "the sweep of the bias", True)]
     return [*found, Claim(id, text, "–", bias[1], bias[0], "First bias whose paired 95 % interval lies below zero.", True)]
 
 
@@ -822,12 +713,12 @@ def _velocity_checks(summary: Summary) -> list[Claim]:
     id, text = "velocity-at-changes", "Velocity RMS within 5 s of 20, 65, 180, 300 s is lower with the AKF (IEKF, Data 1)"
     inside, outside = (_filter_difference(summary, f"velocity_{where}") for where in ("manoeuvre", "elsewhere"))
     if inside is None:
-        found.append(_untested(id, text, "–", "3a and 3b on Data 1", True))
+        found.append(untested(id, text, "–", "3a and 3b on Data 1", True))
     else:
         found.append(Claim(id, text, "–", _change(inside), _reduced(inside), _velocities(summary, inside), True))
     id, text = "velocity-elsewhere", f"Elsewhere velocity RMS is at most {ELSEWHERE_LIMIT_PCT:g} % higher with it (IEKF, Data 1)"
     if outside is None:
-        return [*found, _untested(id, text, "–", "3a and 3b on Data 1", True)]
+        return [*found, untested(id, text, "–", "3a and 3b on Data 1", True)]
     p = outside.percent
     top = p.upper if np.isfinite(p.upper) else p.value
     verdict = Verdict.PARTLY if p.value <= ELSEWHERE_LIMIT_PCT < top else holds(top <= ELSEWHERE_LIMIT_PCT)
@@ -839,7 +730,7 @@ def _fixed_baselines(summary: Summary) -> Claim:
     row = summary.row("5b", 4)
     rms = row.statistics.get("baseline_rms_fixed") if row else None
     if row is None or rms is None:
-        return _untested(id, text, "–", _missing(["5b"], 4), True)
+        return untested(id, text, "–", _missing(["5b"], 4), True)
     wrong = row.statistics.get("wrong_fix")
     evidence = f"Wrong of the fixed epochs: {shown(wrong, '%')}; worst seed {plain(rms.high)} m."
     return Claim(id, text, "–", shown(rms, "m"), at_most(rms, DATA4_RMS_M), evidence + _mark(row), True)
@@ -849,6 +740,6 @@ def _literal_reported(summary: Summary) -> Claim:
     id, text = "literal-reported", "The literal reading of the noise is run and reported beside the default"
     found = [row for row in summary.rows if row.cell.variant == "literal-noise"]
     if not found:
-        return _untested(id, text, "–", "the variant literal-noise", True)
+        return untested(id, text, "–", "the variant literal-noise", True)
     names = ", ".join(algorithm_name(row.cell.algorithm) for row in found)
-    return Claim(id, text, "–", _seeds(len(found[0].seeds)), Verdict.REPRODUCED, f"Run with {names}.", True)
+    return Claim(id, text, "–", seed_count(len(found[0].seeds)), Verdict.REPRODUCED, f"Run with {names}.", True)

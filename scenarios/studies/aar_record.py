@@ -6,25 +6,19 @@ Everything is made of the summary alone, so a page can be made again from the JS
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
 from scenarios.published.aar import DATA_SETS
-from scenarios.solutions import replace_with
 from scenarios.studies.aar_claims import (
     GRAPH_SEES,
     GRAPH_TOLD,
     PAPER_RATIO,
     PAPER_SUCCESS,
-    Claim,
-    Verdict,
     claims,
-    plain,
     robust_advantages,
-    shown,
 )
 from scenarios.studies.aar_summary import (
     ALGORITHMS,
@@ -36,14 +30,23 @@ from scenarios.studies.aar_summary import (
     SWEEP,
     Cell,
     Row,
-    Statistic,
     Summary,
     algorithm_name,
     from_json,
-    json_text,
     metric_of,
     to_json,
 )
+from scenarios.studies.document import (
+    Table,
+    json_text,
+    markdown_section,
+    markdown_table,
+    parameter_table,
+    parameter_texts,
+    write_text,
+)
+from scenarios.studies.statistics import Statistic
+from scenarios.studies.verdicts import count_verdicts, listed_claims, plain, shown, verdict_table
 from scenarios.writers import write_csv, write_parquet
 
 JSON_NAME, PAGE_NAME = "aar.json", "aar.md"
@@ -106,17 +109,6 @@ READINGS = (  # published or left open; done here; variants that show the other 
         (("ins-fault", 3, "345"), ("ins-fault", 4, "45")),
     ),
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """Plain texts; the first `n_text` columns are words, the others numbers."""
-
-    title: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    note: str = ""
-    n_text: int = 1
 
 
 def tables(summary: Summary) -> list[Table]:
@@ -302,10 +294,8 @@ def _pairs(summary: Summary) -> Table:
         if d.metric not in ("p_se", "ratio_mean", "baseline_rms", "velocity_rms", "fault_p_se") or d.second.variant != DEFAULT:
             continue
         where = f"Data {d.first.data}" if d.first.data == d.second.data else f"Data {d.first.data} and {d.second.data}"
-        meaning, n = metric_of(d.metric), d.difference.n
-        title = f"{meaning.title}{f' [{meaning.unit}]' if meaning.unit else ''}"
-        wins = f"{d.better} / {d.worse} / {n - d.better - d.worse}"
-        rows.append((where, title, _name(d.first), _name(d.second), shown(d.difference), shown(d.percent), wins))
+        names = (where, metric_of(d.metric).heading, _name(d.first), _name(d.second))
+        rows.append((*names, shown(d.difference), shown(d.percent), d.tally))
     head = ("data", "quantity", "first", "second", "second less first", "in percent", "seeds better / worse / even")
     note = "Both methods of a pair saw the same noise."
     if any(row.cell.algorithm == GRAPH for row in summary.rows):
@@ -354,28 +344,10 @@ def _starts(summary: Summary) -> Table:
 # Markdown
 
 
-def count_verdicts(found: Sequence[Claim], is_check: bool) -> str:
-    """How many claims have which verdict, in words."""
-    mine = [claim for claim in found if claim.is_check == is_check]
-    counts = {verdict: [claim for claim in mine if claim.verdict is verdict] for verdict in Verdict}
-    return ", ".join(f"{len(group)} {group[0].word}" for group in counts.values() if group) or "none"
-
-
 def record_content(summary: Summary, parameters: Mapping[str, object], command: str) -> dict[str, Any]:
     """What the JSON file holds."""
-    judged = [[c.id, c.text, c.paper, c.ours, c.word, c.evidence] for c in claims(summary)]
-    about = {"study": "aar", "command": command, "parameters": {name: _text(value) for name, value in parameters.items()}}
-    return about | {"claims": judged} | to_json(summary)
-
-
-def _text(value: object) -> str:
-    return (
-        ", ".join(_text(v) for v in value)
-        if isinstance(value, list | tuple)
-        else f"{value:g}"
-        if isinstance(value, float)
-        else str(value)
-    )
+    about = {"study": "aar", "command": command, "parameters": parameter_texts(parameters)}
+    return about | {"claims": listed_claims(claims(summary))} | to_json(summary)
 
 
 def markdown(content: Mapping[str, Any]) -> str:
@@ -392,23 +364,20 @@ def markdown(content: Mapping[str, Any]) -> str:
         f"Claims of the publication: {count_verdicts(judged, False)}. Further checks: {count_verdicts(judged, True)}.\n",
         *_readings_markdown(summary),
         "## Claims\n",
-        _markdown_table(_claim_table([c for c in judged if not c.is_check], "publication")),
+        markdown_table(verdict_table([c for c in judged if not c.is_check], "publication")),
         "## Further checks\n",
-        _markdown_table(_claim_table([c for c in judged if c.is_check], "")),
+        markdown_table(verdict_table([c for c in judged if c.is_check], "")),
     ]
-    for table in tables(summary):
-        parts += [f"## {table.title}\n", _markdown_table(table)] + ([f"{table.note}\n"] if table.note else [])
-    parts += _curves(summary)
-    rows = tuple(content["parameters"].items())
-    parts += ["## Parameters\n", _markdown_table(Table("", ("parameter", "value"), rows, n_text=2))] if rows else []
-    return "\n".join(parts)
+    parameters = parameter_table(content["parameters"])
+    listed = [*tables(summary), *_curves(summary), *([parameters] if parameters.rows else [])]
+    return "\n".join([*parts, *map(markdown_section, listed)])
 
 
 def _readings_markdown(summary: Summary) -> list[str]:
-    table, advantages = readings(summary), robust_advantages(summary)
+    advantages = robust_advantages(summary)
     listed = "".join(f"- {sentence}\n" for sentence in advantages)
     found = [f"{ROBUST_LEAD}\n", listed] if advantages else []
-    return [*found, f"## {table.title}\n", _markdown_table(table), f"{table.note}\n"]
+    return [*found, markdown_section(readings(summary))]
 
 
 def _runs(summary: Summary) -> str:
@@ -422,39 +391,24 @@ def _runs(summary: Summary) -> str:
         rows.append((variant, VARIANTS.get(variant, ""), data, starts, seeds))
     if summary.curves:
         rows.append((SWEEP, VARIANTS[SWEEP], "1", "0", str(max(curve.n for curve in summary.curves))))
-    return _markdown_table(Table("", ("variant", "what", "Data", "start", "seeds"), tuple(rows), n_text=4))
+    return markdown_table(Table("", ("variant", "what", "Data", "start", "seeds"), tuple(rows), n_text=4))
 
 
-def _claim_table(found: Sequence[Claim], source: str) -> Table:
-    if source:
-        rows = tuple((c.text, c.paper, c.ours, c.word, c.evidence) for c in found)
-        return Table("", ("claim", source, "here", "verdict", "evidence"), rows, n_text=5)
-    return Table(
-        "", ("check", "here", "verdict", "evidence"), tuple((c.text, c.ours, c.word, c.evidence) for c in found), n_text=4
-    )
-
-
-def _curves(summary: Summary) -> list[str]:
+def _curves(summary: Summary) -> list[Table]:
     titles = {
         "adop_code": ("ADOP against the code σ [cycles]", ".3g"),
         "adop_ins": ("ADOP against the σ of the INS position [cycles]", ".3g"),
         "success_ins": ("P_corr against the σ of the INS position [%]", ".1f"),
         "success_bias": ("P_corr against a bias of the INS position [%]", ".1f"),
     }
-    parts = []
+    found = []
     for curve in summary.curves:
         if curve.name not in titles:
             continue
         title, form = titles[curve.name]
         rows = tuple((plain(x), *(plain(row[j], form) for row in curve.mean)) for j, x in enumerate(curve.x))
-        parts += [f"## {title}\n", _markdown_table(Table("", (curve.x_title, *curve.labels), rows))]
-    return parts
-
-
-def _markdown_table(table: Table) -> str:
-    marks = ["---" if i < table.n_text else "--:" for i in range(len(table.head))]
-    lines = [table.head, marks, *table.rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+        found.append(Table(title, (curve.x_title, *curve.labels), rows))
+    return found
 
 
 # files
@@ -463,7 +417,7 @@ def _markdown_table(table: Table) -> str:
 def write_record(summary: Summary, folder: Path, parameters: Mapping[str, object], command: str) -> list[Path]:
     """Write the JSON file and the Markdown page of the study. Raises InputError naming what cannot be written."""
     content = record_content(summary, parameters, command)
-    return [_write(folder / JSON_NAME, json_text(content)), _write(folder / PAGE_NAME, markdown(content))]
+    return [write_text(folder / JSON_NAME, json_text(content)), write_text(folder / PAGE_NAME, markdown(content))]
 
 
 def write_table(summary: Summary, folder: Path, stem: str = "results") -> list[Path]:
@@ -483,10 +437,4 @@ def _long_rows(summary: Summary) -> Iterator[tuple[object, ...]]:
     for row in summary.rows:
         cell = row.cell
         for name, s in row.statistics.items():
-            values = (s.value, s.lower, s.upper, s.low, s.high, s.n)
-            yield cell.variant, cell.data, cell.start, cell.algorithm, name, metric_of(name).unit, *values
-
-
-def _write(path: Path, content: str) -> Path:
-    replace_with(path, lambda part: part.write_text(content, encoding="utf-8"))
-    return path
+            yield cell.variant, cell.data, cell.start, cell.algorithm, name, metric_of(name).unit, *s.numbers, s.n

@@ -17,20 +17,29 @@ Source: Wu and others 2022, eqs. 31 to 33, for ratio, ADOP and P_SE.
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from factorgraph.consistency import Interval, band, mean_difference, paired_bootstrap
+from factorgraph.consistency import band, mean_difference
 from factorgraph.errors import InputError
 from factorgraph.types import Array, BoolArray
+from scenarios.studies.statistics import (
+    CONSISTENT_PCT,
+    NAN,
+    NEES_PROB,
+    Metric,
+    PairedDifference,
+    Statistic,
+    compared,
+    gain_percent,
+    mean_of_known,
+)
 
 FORMAT = 1
-NAN = float("nan")
 SCHEMES = {"1": "WLS", "2": "EKF", "3": "IEKF", "4": "IBRKF", "5": "IBRCAF"}
 FILTERS = {"a": "SKF", "b": "AKF"}
 GRAPH = "graph"
@@ -39,8 +48,6 @@ DEFAULT = "default"
 SWEEP = "sweep"
 RATIO_THRESHOLD = 3.0
 RATIO_CAP = 1000.0
-NEES_PROB = 0.99
-CONSISTENT_PCT = 90.0
 MANOEUVRES_S = (20.0, 65.0, 180.0, 300.0)  # where the flight state changes
 MANOEUVRE_HALF_S = 5.0
 DIGITS = 4  # significant, of every number of the summary
@@ -62,15 +69,6 @@ class Cell(NamedTuple):
     data: int
     algorithm: str
     start: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Metric:
-    """What a number of the summary means; `better` is +1 where larger is better, -1 where smaller is, else 0."""
-
-    title: str
-    unit: str
-    better: int
 
 
 METRICS = {
@@ -121,18 +119,6 @@ VARIANT_KEPT = (  # of other variants than the main set
 
 
 @dataclass(frozen=True, slots=True)
-class Statistic:
-    """Mean over seeds with its interval (NaN of a single seed), the smallest and the largest seed."""
-
-    value: float
-    lower: float
-    upper: float
-    low: float
-    high: float
-    n: int
-
-
-@dataclass(frozen=True, slots=True)
 class Row:
     """All numbers of one algorithm on one data set, by the names of `METRICS`; "name@20" is the one at or from 20 s."""
 
@@ -152,17 +138,7 @@ class Row:
         return sorted((float(at), value) for (name, at), value in found if name == metric)
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """`second` less `first` over common seeds, and the same in percent of `first`; better counts the seeds `second` wins."""
-
-    metric: str
-    first: Cell
-    second: Cell
-    difference: Statistic
-    percent: Statistic
-    better: int
-    worse: int
+Difference = PairedDifference[Cell]
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,21 +267,21 @@ def measure(arrays: Mapping[str, Array], algorithm: str, data: int) -> dict[str,
         "p_fix": _percent(fixed),
         "p_se": _percent(success),
         "wrong_fix": _percent(~right[fixed]),
-        "ratio_mean": _mean(ratio),
+        "ratio_mean": mean_of_known(ratio),
         "ratio_median": _median(ratio),
-        "adop_mean": _mean(get("adop_cyc")),
-        "success_rate": 100 * _mean(get("success_rate")),
+        "adop_mean": mean_of_known(get("adop_cyc")),
+        "success_rate": 100 * mean_of_known(get("success_rate")),
         "main_rms": _rms(main),
         "main_max": _largest(main),
-        "nis_mean": _mean(get("nis")),
+        "nis_mean": mean_of_known(get("nis")),
         "ins_sigma": _median(get("ins_sigma_m")),
-        "runtime": _mean(get("runtime_s").reshape(-1)),
+        "runtime": mean_of_known(get("runtime_s").reshape(-1)),
     }
     for name, values in (("baseline", baseline), ("velocity", velocity)):
         for suffix, kept in (("", values), ("_fixed", values[fixed])):
             found |= {
                 f"{name}_rms{suffix}": _rms(kept),
-                f"{name}_mean{suffix}": _mean(kept),
+                f"{name}_mean{suffix}": mean_of_known(kept),
                 f"{name}_max{suffix}": _largest(kept),
             }
     found |= _consistency(get("nees"), algorithm) | _adaptation(get("alpha"), fixed, right)
@@ -320,7 +296,7 @@ def measure(arrays: Mapping[str, Array], algorithm: str, data: int) -> dict[str,
 def _consistency(nees: Array, algorithm: str) -> dict[str, float]:
     known = nees[np.isfinite(nees)]
     lower, upper = band(float(nees_dimension(algorithm)), NEES_PROB)
-    return {"nees_mean": _mean(known), "nees_in_band": _percent((known >= lower) & (known <= upper))}
+    return {"nees_mean": mean_of_known(known), "nees_in_band": _percent((known >= lower) & (known <= upper))}
 
 
 def nees_dimension(algorithm: str) -> int:
@@ -333,7 +309,7 @@ def _adaptation(alpha: Array, fixed: BoolArray, right: BoolArray) -> dict[str, f
         return {}
     acts = alpha < 1
     wrong = acts[fixed & ~right]
-    return {"alpha_mean": _mean(alpha), "adapted_wrong": _percent(wrong), "adapted_right": _percent(acts[fixed & right])}
+    return {"alpha_mean": mean_of_known(alpha), "adapted_wrong": _percent(wrong), "adapted_right": _percent(acts[fixed & right])}
 
 
 def _in_windows(
@@ -368,11 +344,6 @@ def _percent(hits: BoolArray) -> float:
 
 def _finite(x: Array) -> Array:
     return x[np.isfinite(x)]
-
-
-def _mean(x: Array) -> float:
-    x = _finite(x)
-    return float(np.mean(x)) if x.size else float("nan")
 
 
 def _median(x: Array) -> float:
@@ -453,28 +424,17 @@ def _statistic(x: Array) -> Statistic:
     return _compared(np.zeros_like(x), x)
 
 
-def _compared(a: Array, b: Array, compare: Any = mean_difference) -> Statistic:
-    """compare(a, b) with its bootstrap interval over seeds; low and high are of the seeds one by one."""
-    if len(a) > 1:
-        found = paired_bootstrap(a, b, np.random.default_rng(0), compare)
-    else:
-        found = Interval(float(compare(a, b)), float("nan"), float("nan"), len(a))
-    single = compare(a[:, None], b[:, None])
-    low, high = (_rounded(float(v)) for v in (np.min(single), np.max(single)))
-    return Statistic(_rounded(found.value), _rounded(found.lower), _rounded(found.upper), low, high, len(a))
-
-
-def _gain_percent(a: Array, b: Array) -> Array:
-    """How much larger the mean of b is than that of a, in percent of the latter's size."""
-    base = np.mean(a, axis=-1)
-    size = np.where(base != 0, np.abs(base), np.nan)
-    return np.asarray(100 * (np.mean(b, axis=-1) - base) / size)
+def _compared(a: Array, b: Array, compare: Callable[[Array, Array], Array] = mean_difference) -> Statistic:
+    """Like `compared`, to the digits of the summary."""
+    found = compared(a, b, compare)
+    value, lower, upper, low, high = map(_rounded, found.numbers)
+    return Statistic(value, lower, upper, low, high, found.n)
 
 
 def _difference(metric: str, first: Cell, second: Cell, a: Array, b: Array) -> Difference:
     sign = metric_of(metric).better
     usable = np.all(a != 0)  # a percentage of nothing is not known
-    percent = _compared(a, b, _gain_percent) if usable else Statistic(NAN, NAN, NAN, NAN, NAN, len(a))
+    percent = _compared(a, b, gain_percent) if usable else Statistic(NAN, NAN, NAN, NAN, NAN, len(a))
     won, lost = int(np.sum(sign * (b - a) > 0)), int(np.sum(sign * (b - a) < 0))
     return Difference(metric, first, second, _compared(a, b), percent, won, lost)
 
@@ -615,21 +575,6 @@ def _read_curve(c: Mapping[str, Any]) -> Curve:
     return Curve(c["name"], c["x_title"], tuple(c["x"]), tuple(c["labels"]), mean, lower, upper, c["n"])
 
 
-def json_text(content: Mapping[str, Any]) -> str:
-    """JSON with one row, difference or curve a line: small, and readable in a comparison of versions."""
-
-    def short(value: object) -> str:
-        return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
-
-    parts = []
-    for key, value in content.items():
-        if isinstance(value, list) and value and isinstance(value[0], list | dict):
-            parts.append(f"{short(key)}:[\n" + ",\n".join(short(item) for item in value) + "\n]")
-        else:
-            parts.append(f"{short(key)}:{short(value)}")
-    return "{\n" + ",\n".join(parts) + "\n}\n"
-
-
 def _runs(seeds: tuple[int, ...]) -> list[list[int]]:
     """First and last of every unbroken run of ascending seeds."""
     runs: list[list[int]] = []
@@ -643,7 +588,7 @@ def _runs(seeds: tuple[int, ...]) -> list[list[int]]:
 
 def _listed(s: Statistic, n_usual: int = 0) -> list[float | int | None]:
     """The numbers of a statistic; the number of seeds only where it is not the usual one."""
-    return [*(_plain(v) for v in (s.value, s.lower, s.upper, s.low, s.high)), *([] if s.n == n_usual else [s.n])]
+    return [*map(_plain, s.numbers), *([] if s.n == n_usual else [s.n])]
 
 
 def _read(found: list[Any], n_usual: int = 0) -> Statistic:

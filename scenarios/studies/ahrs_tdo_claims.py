@@ -1,14 +1,10 @@
 """What the publication on the adaptive AHRS filter claims, each with our number and a verdict that follows from it.
 
-How verdicts follow, N the number of the publication (one run; its trajectory, attitude errors and sky are not known):
+How verdicts follow stands in `scenarios.studies.verdicts`; the publication's numbers come from one run, whose trajectory,
+attitude errors and sky are not known.
 
-    a number           reproduced where N lies within the span of our seeds or near our mean, partly where not far from it
-    "A better than B"  reproduced where the 95 % interval of the paired difference lies on the right side of zero, partly where
-                       only the mean does
-    several at once    reproduced where all are, not reproduced where none is, else partly; what was not run is left out
-
-AHRS+TDO is `ahrs_tdo_summary.PUBLISHED`; other readings of it are named in the evidence. Further checks follow the same rules and
-are called met. Source: Lu et al. (2024), tables 3 and 4, figures 5 to 16; spec ahrs_tdo.md, sections 4 to 6.
+AHRS+TDO is `ahrs_tdo_summary.PUBLISHED`; other readings of it are named in the evidence. Source: Lu et al. (2024), tables 3
+and 4, figures 5 to 16; spec ahrs_tdo.md, sections 4 to 6.
 """
 
 from __future__ import annotations
@@ -19,8 +15,6 @@ import numpy as np
 
 from scenarios.metrics_ranks import LEVEL
 from scenarios.published.ahrs_tdo_filters import CA_CV, FILTERS
-from scenarios.studies.aar_claims import Claim, Verdict, holds, near, negated, plain, positive, shown, together
-from scenarios.studies.aar_summary import Statistic
 from scenarios.studies.ahrs_tdo import PHASES, SEARCH_METHODS
 from scenarios.studies.ahrs_tdo_summary import (
     AXES,
@@ -33,6 +27,20 @@ from scenarios.studies.ahrs_tdo_summary import (
     Search,
     Summary,
     title_of,
+)
+from scenarios.studies.statistics import Statistic
+from scenarios.studies.verdicts import (
+    Claim,
+    Verdict,
+    holds,
+    near,
+    negated,
+    plain,
+    positive,
+    seed_count,
+    shown,
+    together,
+    untested,
 )
 
 METHODS = {PUBLISHED: "AHRS+TDO", PLAIN: "AHRS", CA_CV: "CA/CV"}
@@ -86,7 +94,7 @@ def _tables(summary: Summary) -> Iterator[Claim]:
                 id, text = f"table-{letter}-{name}-{axis}", f"{what} {axis.upper()}, RMSE of {METHODS[name]}"
                 paper, found = f"{plain(value)} {unit} ({source})", summary.of(name, f"{letter}_{axis}")
                 if found is None:
-                    yield _untested(id, text, paper, name)
+                    yield untested(id, text, paper, name)
                     continue
                 verdict = near(found, value, RMSE_NEAR * value, RMSE_FAR * value)
                 yield Claim(id, text, paper, shown(found, unit), verdict, _span(found, value, unit))
@@ -116,7 +124,7 @@ def _gains(summary: Summary) -> Iterator[Claim]:
 def _gain(summary: Summary, id: str, text: str, paper: str, metric: str, other: str, value: float) -> Claim:
     found = summary.compare(metric, other, PUBLISHED)
     if found is None:
-        return _untested(id, text, paper, f"{PUBLISHED}, {other}")
+        return untested(id, text, paper, f"{PUBLISHED}, {other}")
     reduction = negated(found.percent)
     return Claim(id, text, paper, shown(reduction, "%", ".1f"), near(reduction, value, GAIN_NEAR, GAIN_FAR), _told(found))
 
@@ -127,7 +135,7 @@ def _velocity(summary: Summary) -> Iterator[Claim]:
         text = f"Velocity {axis.upper()}: errors of CA/CV are {value:.2f} times those of AHRS+TDO"
         found = summary.ratio(f"v_{axis}", CA_CV, PUBLISHED)
         if found is None:
-            yield _untested(f"ratio-v-{axis}", text, f"{value:.2f} (Table 4)", f"{PUBLISHED}, {CA_CV}")
+            yield untested(f"ratio-v-{axis}", text, f"{value:.2f} (Table 4)", f"{PUBLISHED}, {CA_CV}")
             continue
         verdict = near(found, value, RMSE_NEAR * value, RMSE_FAR * value)
         plain_ratio = summary.ratio(f"v_{axis}", CA_CV, PLAIN)
@@ -150,7 +158,7 @@ def _best(summary: Summary) -> Iterator[Claim]:
     for id, text, paper, metric in listed:
         found = {other: d for other in (PLAIN, CA_CV) if (d := summary.compare(metric, other, PUBLISHED)) is not None}
         if not found:
-            yield _untested(id, text, paper, f"{PUBLISHED}, {PLAIN}, {CA_CV}")
+            yield untested(id, text, paper, f"{PUBLISHED}, {PLAIN}, {CA_CV}")
             continue
         verdict = together(positive(negated(d.difference)) for d in found.values())
         ours = "; ".join(f"against {METHODS[other]} {shown(d.percent, '%', '.1f')}" for other, d in found.items())
@@ -174,7 +182,7 @@ def _slightly(summary: Summary) -> Claim:
     id, text = "slightly", "AHRS is slightly better in position than CA/CV"
     paper, found = "1.6, 3.1, 2.7 % in X, Y, Z (Table 3)", summary.compare("r_3d", CA_CV, PLAIN)
     if found is None:
-        return _untested(id, text, paper, f"{PLAIN}, {CA_CV}")
+        return untested(id, text, paper, f"{PLAIN}, {CA_CV}")
     gain = negated(found.percent)
     verdict = positive(gain)
     if verdict is Verdict.REPRODUCED and gain.value > SLIGHTLY_PCT:
@@ -185,7 +193,7 @@ def _slightly(summary: Summary) -> Claim:
 def _same_distributions(summary: Summary) -> Claim:
     id, text, paper = "same-cdf", "Position errors of AHRS and CA/CV are distributed nearly alike", "Fig. 7"
     if not (PLAIN in summary.rows and CA_CV in summary.rows):
-        return _untested(id, text, paper, f"{PLAIN}, {CA_CV}")
+        return untested(id, text, paper, f"{PLAIN}, {CA_CV}")
     far, velocity = (summary.cdf_distance(what, PLAIN, CA_CV) for what in ("position_m", "velocity_mps"))
     verdict = Verdict.REPRODUCED if far <= CDF_NEAR else Verdict.PARTLY if far <= CDF_FAR else Verdict.NOT_REPRODUCED
     evidence = f"Largest distance of the two distributions over all seeds and epochs; {plain(velocity, '.2f')} in velocity."
@@ -201,7 +209,7 @@ def _searched(summary: Summary) -> Iterator[Claim]:
         id, text = f"search-{other}", f"TDO finds lower objectives than {other.upper()}"
         found = {which: s for which, s in summary.searches.items() if {"tdo", other} <= set(s.excess)}
         if not found:
-            yield _untested(id, text, "Fig. 5", "searches")
+            yield untested(id, text, "Fig. 5", "searches")
             continue
         verdict = together(_lower(s, other) for s in found.values())
         ours = "; ".join(f"{which}: {_medians(s, ('tdo', other))}" for which, s in found.items())
@@ -240,7 +248,7 @@ def _swapped(summary: Summary) -> Iterator[Claim]:
         id, text = f"filter-{other}", f"The filter is better with TDO than with {what}"
         found = [d for metric in ("r_3d", "v_3d") if (d := summary.compare(metric, other, "ahrs-tdo-o2")) is not None]
         if not found:
-            yield _untested(id, text, "Fig. 5", f"ahrs-tdo-o2, {other}")
+            yield untested(id, text, "Fig. 5", f"ahrs-tdo-o2, {other}")
             continue
         verdict = together(positive(negated(d.difference)) for d in found)
         ours = "; ".join(f"{METRICS[d.metric].title} {shown(d.percent, '%', '.2f')}" for d in found)
@@ -270,7 +278,7 @@ def _levels(summary: Summary) -> Iterator[Claim]:
         id, text = f"level-{letter}", f"AHRS, {what} RMSE per axis between {low:g} and {high:g} {unit}"
         found = {axis: s for axis in AXES if (s := summary.of(PLAIN, f"{letter}_{axis}")) is not None}
         if not found:
-            yield _untested(id, text, "", PLAIN, is_check=True)
+            yield untested(id, text, "", PLAIN, is_check=True)
             continue
         verdict = together(holds(low <= s.value <= high) for s in found.values())
         ours = "; ".join(f"{axis.upper()} {shown(s, unit)}" for axis, s in found.items())
@@ -283,7 +291,7 @@ def _rates(summary: Summary) -> Iterator[Claim]:
         id, text = f"rate-{rule}", f"The {word} rule triggers without a fault in {low:g} to {high:g} % of the updates"
         found = summary.rules.get(rule, {}).get("none")
         if found is None:
-            yield _untested(id, text, "", "rules", is_check=True)
+            yield untested(id, text, "", "rules", is_check=True)
             continue
         flown = summary.of(PUBLISHED if rule == "literal" else "ahrs-nis-o3", "triggered_quiet")
         evidence = (
@@ -298,7 +306,7 @@ def _minima(summary: Summary) -> Iterator[Claim]:
         id, text = f"minimum-{which}", f"{which}: all searches come within {NEAR_MINIMUM:g} of Gauss-Newton's minimum"
         search = summary.searches.get(which)
         if search is None:
-            yield _untested(id, text, "", "searches", is_check=True)
+            yield untested(id, text, "", "searches", is_check=True)
             continue
         worst = {m: float(np.max(x)) for m, x in search.excess.items()}
         verdict = together(holds(x <= NEAR_MINIMUM) for x in worst.values())
@@ -320,7 +328,7 @@ def _ablation(summary: Summary) -> Iterator[Claim]:
     id, text = "ablation-velocity", "AHRS has smaller velocity errors than CA/CV"
     found = summary.compare("v_3d", CA_CV, PLAIN)
     if found is None:
-        yield _untested(id, text, "", f"{PLAIN}, {CA_CV}", is_check=True)
+        yield untested(id, text, "", f"{PLAIN}, {CA_CV}", is_check=True)
     else:
         ours = f"AHRS against CA/CV {shown(found.percent, '%', '.1f')}"
         yield Claim(id, text, "", ours, positive(negated(found.percent)), _told(found), is_check=True)
@@ -328,7 +336,7 @@ def _ablation(summary: Summary) -> Iterator[Claim]:
         id, text = f"worse-{name}", f"{FILTERS[name].title} is no better than AHRS, since it forgets the prediction"
         told = [d for metric in ("r_3d", "v_3d") if (d := summary.compare(metric, PLAIN, name)) is not None]
         if not told:
-            yield _untested(id, text, "", f"{PLAIN}, {name}", is_check=True)
+            yield untested(id, text, "", f"{PLAIN}, {name}", is_check=True)
             continue
         verdict = together(_no_better(d.difference) for d in told)
         ours = "; ".join(f"{METRICS[d.metric].title} {shown(d.percent, '%', '.1f')}" for d in told)
@@ -348,7 +356,7 @@ def _at_manoeuvres(summary: Summary) -> Iterator[Claim]:
         id, text = f"windows-{name}", f"{FILTERS[name].title} is better than AHRS at manoeuvres, in position and velocity"
         inside = [d for m in ("r_manoeuvre", "v_manoeuvre") if (d := summary.compare(m, PLAIN, name)) is not None]
         if not inside:
-            yield _untested(id, text, "", f"{PLAIN}, {name}, or the flight was too short", is_check=True)
+            yield untested(id, text, "", f"{PLAIN}, {name}, or the flight was too short", is_check=True)
             continue
         quiet = [d for m in ("r_quiet", "v_quiet") if (d := summary.compare(m, PLAIN, name)) is not None]
         verdict = together(positive(negated(d.difference)) for d in inside)
@@ -362,7 +370,7 @@ def _consistent(summary: Summary) -> Iterator[Claim]:
         id, text = f"nees-{name}", f"The covariance of {name_of(name)} is consistent"
         row = summary.rows.get(name)
         if row is None:
-            yield _untested(id, text, "", name, is_check=True)
+            yield untested(id, text, "", name, is_check=True)
             continue
         ours = f"NEES {shown(row.of('nees'))}, expected 6"
         evidence = f"The mean over the seeds lies in its 99 % band at {plain(row.nees_consistent, '.0f')} % of the epochs."
@@ -374,7 +382,7 @@ def _fast_enough(summary: Summary) -> Claim:
     times = {name: s for name, row in summary.rows.items() if name in FILTERS and (s := row.of("runtime")) is not None}
     plain_ones = {name: s for name, s in times.items() if FILTERS[name].correction is None}
     if not plain_ones:
-        return _untested(id, text, "", "relative filters without TDO", is_check=True)
+        return untested(id, text, "", "relative filters without TDO", is_check=True)
     slowest = max(plain_ones, key=lambda name: plain_ones[name].value)
     evidence = "Processor time, without simulation and the vehicles' own filters."
     if len(times) > len(plain_ones):
@@ -419,11 +427,6 @@ def _bound_words(summary: Summary, i: int, found: Statistic, aim: float, unit: s
 
 
 def _told(d: Difference) -> str:
-    n = d.difference.n
     unit = METRICS[d.metric].unit
-    wins = f"better in {d.better} of {n} seed{'s' if n != 1 else ''}"
+    wins = f"better in {d.better} of {seed_count(d.difference.n)}"
     return f"{name_of(d.second)} less {name_of(d.first)}, {METRICS[d.metric].title}: {shown(d.difference, unit)}, {wins}."
-
-
-def _untested(id: str, text: str, paper: str, missing: str, is_check: bool = False) -> Claim:
-    return Claim(id, text, paper, "–", Verdict.NOT_TESTED, f"Not run: {missing}.", is_check)

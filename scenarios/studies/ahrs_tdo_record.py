@@ -8,11 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from scenarios.metrics_ranks import LEVEL
 from scenarios.published.ahrs_tdo_filters import CA_CV, FILTERS, TUNING_SEEDS, WALKS
-from scenarios.solutions import replace_with
-from scenarios.studies.aar_claims import Claim, plain, shown
-from scenarios.studies.aar_record import count_verdicts
-from scenarios.studies.aar_summary import CONSISTENT_PCT, Statistic, json_text
 from scenarios.studies.ahrs_tdo import TUNED_UNTIL_S, parameters
 from scenarios.studies.ahrs_tdo_claims import NEAR_MINIMUM, PAPER_POSITION, PAPER_VELOCITY, claims, name_of
 from scenarios.studies.ahrs_tdo_summary import (
@@ -30,8 +27,18 @@ from scenarios.studies.ahrs_tdo_summary import (
     summarise,
     title_of,
 )
-from scenarios.studies.document import Table, markdown_section, markdown_table
+from scenarios.studies.document import (
+    Table,
+    json_text,
+    markdown_section,
+    markdown_table,
+    parameter_table,
+    parameter_texts,
+    write_text,
+)
+from scenarios.studies.statistics import CONSISTENT_PCT, Statistic
 from scenarios.studies.study import Job, Outcome, Results
+from scenarios.studies.verdicts import Claim, count_verdicts, listed_claims, plain, shown, verdict_table
 
 JSON_NAME, PAGE_NAME, REPORT_NAME = "ahrs-tdo.json", "ahrs-tdo.md", "report.html"
 INCONSISTENT = "‡"
@@ -122,9 +129,7 @@ def _table(summary: Summary, title: str, metrics: Sequence[str], note: str = "",
         cells = [shown(row.of(m), "", form) for m in metrics]
         if any(cell != "–" for cell in cells):
             rows.append((marked(row), *cells))
-    units = (METRICS[m] for m in metrics)
-    head = ("estimator", *(f"{m.title}{f' [{m.unit}]' if m.unit else ''}" for m in units))
-    return Table(title, head, tuple(rows), note)
+    return Table(title, ("estimator", *(METRICS[m].heading for m in metrics)), tuple(rows), note)
 
 
 def spread_table(summary: Summary) -> Table:
@@ -166,9 +171,7 @@ def pair_table(summary: Summary, kind: str) -> Table:
             cells.append(shown(d.percent, "", ".1f") if d else "–")
         d = summary.compare(f"{letter}_3d", first, second)
         if d is not None:
-            n = d.difference.n
-            wins = f"{d.better} / {d.worse} / {n - d.better - d.worse}"
-            rows.append((name_of(first), name_of(second), shown(d.difference), *cells, wins))
+            rows.append((name_of(first), name_of(second), shown(d.difference), *cells, d.tally))
     unit = METRICS[f"{letter}_3d"].unit
     head = (
         "first",
@@ -214,7 +217,7 @@ def _tested(search: Search, method: str) -> str:
     if method == "tdo" or "tdo" not in search.excess:
         return ""
     test = search.against("tdo", method)
-    word = "no difference" if test.p >= 0.05 or test.sign == 0 else "lower" if test.sign > 0 else "higher"
+    word = "no difference" if test.p >= LEVEL or test.sign == 0 else "lower" if test.sign > 0 else "higher"
     return f"{word} (p = {plain(test.p, '.2g')})"
 
 
@@ -255,16 +258,6 @@ def readings_table() -> Table:
     return Table("What is read or done otherwise", ("published or left open", "here"), READINGS, n_text=2)
 
 
-def claim_table(found: Sequence[Claim], source: str) -> Table:
-    """Claims, or checks where `source` is empty."""
-    if source:
-        rows = tuple((c.text, c.paper, c.ours, c.word, c.evidence) for c in found)
-        return Table("", ("claim", source, "here", "verdict", "evidence"), rows, n_text=5)
-    return Table(
-        "", ("check", "here", "verdict", "evidence"), tuple((c.text, c.ours, c.word, c.evidence) for c in found), n_text=4
-    )
-
-
 # files
 
 
@@ -274,8 +267,8 @@ def write(results: Results[Job], folder: Path, command: str) -> Outcome:
 
     summary = summarise(results)
     judged = claims(summary)
-    _write(folder / JSON_NAME, json_text(record(summary, judged, command)))
-    _write(folder / PAGE_NAME, markdown(summary, judged, command))
+    write_text(folder / JSON_NAME, json_text(record(summary, judged, command)))
+    write_text(folder / PAGE_NAME, markdown(summary, judged, command))
     write_study(summary, judged, results, folder / REPORT_NAME, command)
     said = [
         f"claims of the publication: {count_verdicts(judged, is_check=False)}",
@@ -290,10 +283,6 @@ def _aim_lines(judged: Sequence[Claim]) -> list[str]:
     return [f"{c.text}: {c.word} ({c.ours}). {c.evidence}" for c in judged if c.id.startswith("aim-r")]
 
 
-def _write(path: Path, content: str) -> None:
-    replace_with(path, lambda part: part.write_text(content, encoding="utf-8"))
-
-
 def markdown(summary: Summary, judged: Sequence[Claim], command: str) -> str:
     """The record as a page of the documentation."""
     parts = [
@@ -303,28 +292,13 @@ def markdown(summary: Summary, judged: Sequence[Claim], command: str) -> str:
         f"Claims of the publication: {count_verdicts(judged, False)}. Further checks: {count_verdicts(judged, True)}.\n",
         markdown_section(readings_table()),
         "## Claims\n",
-        markdown_table(claim_table([c for c in judged if not c.is_check], "published")),
+        markdown_table(verdict_table([c for c in judged if not c.is_check], "published")),
         "## Further checks\n",
-        markdown_table(claim_table([c for c in judged if c.is_check], "")),
+        markdown_table(verdict_table([c for c in judged if c.is_check], "")),
         *(markdown_section(table) for table in tables(summary)),
-        markdown_section(parameter_table()),
+        markdown_section(parameter_table(parameter_texts(parameters()))),
     ]
     return "\n".join(parts)
-
-
-def parameter_table() -> Table:
-    rows = tuple((name, _text(value)) for name, value in parameters().items())
-    return Table("Parameters", ("parameter", "value"), rows, n_text=2)
-
-
-def _text(value: object) -> str:
-    return (
-        ", ".join(map(_text, value))
-        if isinstance(value, list | tuple)
-        else f"{value:g}"
-        if isinstance(value, float)
-        else str(value)
-    )
 
 
 def record(summary: Summary, judged: Sequence[Claim], command: str) -> dict[str, Any]:
@@ -332,9 +306,9 @@ def record(summary: Summary, judged: Sequence[Claim], command: str) -> dict[str,
     return {
         "study": "ahrs-tdo",
         "command": command,
-        "parameters": {name: _text(value) for name, value in parameters().items()},
+        "parameters": parameter_texts(parameters()),
         "statistic": ["mean", "lower", "upper", "smallest seed", "largest seed", "seeds"],
-        "claims": [[c.id, c.text, c.paper, c.ours, c.word, c.evidence] for c in judged],
+        "claims": listed_claims(judged),
         "rows": [
             {
                 "name": row.name,
@@ -362,7 +336,7 @@ def record(summary: Summary, judged: Sequence[Claim], command: str) -> dict[str,
 
 
 def _listed(s: Statistic) -> list[float | None]:
-    return [_number(v) for v in (s.value, s.lower, s.upper, s.low, s.high, s.n)]
+    return [_number(v) for v in (*s.numbers, s.n)]
 
 
 def _number(value: float) -> float | None:

@@ -12,20 +12,30 @@ Intervals of means are Student's, of paired differences bootstrapped over the se
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from factorgraph.consistency import Interval, average_nees, mean_difference, mean_interval, nis_band, paired_bootstrap
+from factorgraph.consistency import average_nees, mean_interval, nis_band
 from factorgraph.types import Array, BoolArray
 from scenarios.metrics_ranks import PairedTest, paired_test
 from scenarios.published.ahrs_tdo import MANOEUVRES
 from scenarios.published.ahrs_tdo_filters import CA_CV, FILTERS
-from scenarios.studies.aar_summary import CONSISTENT_PCT, NAN, NEES_PROB, Metric, Statistic
 from scenarios.studies.ahrs_tdo import BOUND, GRID, OTHERS, PHASES, RULES, SEARCH_METHODS, SEARCHES, TUNING
+from scenarios.studies.statistics import (
+    CONSISTENT_PCT,
+    NAN,
+    NEES_PROB,
+    Metric,
+    PairedDifference,
+    Statistic,
+    compared,
+    gain_percent,
+    mean_of_known,
+)
 from scenarios.studies.study import Arrays, Job, Results
 
 SETTLED_S = 60.0  # the first straight leg is not counted
@@ -93,17 +103,7 @@ class Row:
         return self.nees_consistent >= CONSISTENT_PCT
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """`second` less `first` over common seeds, and in percent of the first's mean; better counts the seeds `second` wins."""
-
-    metric: str
-    first: str
-    second: str
-    difference: Statistic
-    percent: Statistic
-    better: int
-    worse: int
+Difference = PairedDifference[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +177,7 @@ class Summary:
         if not len(x):
             return None
         better = METRICS[metric].better * (y - x)
-        percent = compared(x, y, _gain_percent)
+        percent = compared(x, y, gain_percent)
         return Difference(metric, first, second, compared(x, y), percent, int(np.sum(better > 0)), int(np.sum(better < 0)))
 
     def ratio(self, metric: str, first: str, second: str) -> Statistic | None:
@@ -220,21 +220,6 @@ def statistic(x: Array) -> Statistic | None:
     found = mean_interval(x)
     lower, upper = (v if np.isfinite(v) else NAN for v in (found.lower, found.upper))
     return Statistic(found.value, lower, upper, float(x.min()), float(x.max()), len(x))
-
-
-def compared(a: Array, b: Array, compare: Callable[[Array, Array], Array] = mean_difference) -> Statistic:
-    """compare(a, b) over seeds (S,) with its bootstrap interval; low and high are of the seeds one by one."""
-    if len(a) > 1:
-        found = paired_bootstrap(a, b, np.random.default_rng(0), compare)
-    else:
-        found = Interval(float(compare(a, b)), NAN, NAN, len(a))
-    single = compare(a[:, None], b[:, None])
-    return Statistic(found.value, found.lower, found.upper, float(np.min(single)), float(np.max(single)), len(a))
-
-
-def _gain_percent(a: Array, b: Array) -> Array:
-    base = np.mean(a, axis=-1)
-    return np.asarray(100 * (np.mean(b, axis=-1) - base) / np.where(base != 0, base, np.nan))
 
 
 # trials
@@ -289,7 +274,7 @@ def measure(arrays: Arrays, name: str) -> Trial:
     nees_of = np.asarray(arrays[f"{name}/nees"], float)[counted]
     inside = manoeuvring(t_s)
     norms = Norms(np.linalg.norm(r, axis=1), np.linalg.norm(v, axis=1))
-    values: dict[str, float] = {"nees": _mean(nees_of), "runtime": float(arrays[f"{name}/runtime_s"])}
+    values: dict[str, float] = {"nees": mean_of_known(nees_of), "runtime": float(arrays[f"{name}/runtime_s"])}
     for letter, error, size in (("r", r, norms.position_m), ("v", v, norms.velocity_mps)):
         values |= {f"{letter}_{axis}": _rms(error[:, i]) for i, axis in enumerate(AXES)}
         values |= {f"{letter}_std_{axis}": float(np.std(error[:, i])) for i, axis in enumerate(AXES)}
@@ -305,7 +290,7 @@ def measure(arrays: Arrays, name: str) -> Trial:
         if name in FILTERS and FILTERS[name].correction is not None:
             hit = np.asarray(arrays[f"{name}/triggered"], bool)[counted]
             parts = (("triggered", updated), ("triggered_manoeuvre", updated & inside), ("triggered_quiet", updated & ~inside))
-            values |= {what: 100 * _mean(hit[at].astype(float)) for what, at in parts}
+            values |= {what: 100 * mean_of_known(hit[at].astype(float)) for what, at in parts}
     return Trial(values, norms, nees_of, t_s, rows)
 
 
@@ -330,11 +315,6 @@ def _row(name: str, trials: Mapping[int, Trial]) -> Row:
 
 def _rms(x: Array) -> float:
     return float(np.sqrt(np.mean(x**2))) if len(x) else NAN
-
-
-def _mean(x: Array) -> float:
-    x = x[np.isfinite(x)]
-    return float(np.mean(x)) if len(x) else NAN
 
 
 # sidelines

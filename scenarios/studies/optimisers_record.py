@@ -13,7 +13,7 @@ import numpy as np
 
 from factorgraph.consistency import Interval
 from scenarios.metrics_ranks import LEVEL
-from scenarios.studies.document import Table, markdown_section
+from scenarios.studies.document import Table, markdown_section, write_text
 from scenarios.studies.optimisers import KINDS, N_MEMBERS, PARTS, available
 from scenarios.studies.optimisers_summary import SUBJECT, Problem, Summary, Verdict, summarise
 from scenarios.studies.study import Job, Outcome, Results
@@ -200,8 +200,8 @@ def write(results: Results[Job], folder: Path, options: argparse.Namespace) -> O
     summary = summarise(results)
     command = command_line(options)
     content = json.dumps(record(summary, command), separators=(",", ":"), allow_nan=False).replace(',{"', ',\n{"')
-    (folder / JSON_NAME).write_text(content + "\n", encoding="utf-8")
-    (folder / PAGE_NAME).write_text(markdown(summary, command), encoding="utf-8")
+    write_text(folder / JSON_NAME, content + "\n")
+    write_text(folder / PAGE_NAME, markdown(summary, command))
     write_study(summary, folder / REPORT_NAME, command)
     return Outcome((*sentences(summary), f"written: {JSON_NAME}, {PAGE_NAME}, {REPORT_NAME} in {folder}"))
 

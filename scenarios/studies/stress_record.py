@@ -15,6 +15,7 @@ from factorgraph.consistency import Interval, band, mean_interval, paired_bootst
 from factorgraph.types import Array
 from scenarios.report.frame import Card, Page, Section, write_page
 from scenarios.report.tables import paragraph, table
+from scenarios.studies.document import write_text
 from scenarios.studies.stress import CASES, FRACTIONS, parameters
 from scenarios.studies.study import Job, Outcome, Results
 
@@ -131,8 +132,8 @@ def write(results: Results[Job], folder: Path, options: argparse.Namespace) -> O
     summaries = summarise(results)
     command = f"relnav study stress{' --quick' if options.quick else ''}"
     tree = {"command": command, "cases": {s.name: _plain(s) for s in summaries}, "parameters": dict(parameters())}
-    (folder / "stress.json").write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
-    (folder / "stress.md").write_text(markdown(summaries, command), encoding="utf-8")
+    write_text(folder / "stress.json", json.dumps(tree, indent=1) + "\n")
+    write_text(folder / "stress.md", markdown(summaries, command))
     write_page(_page(summaries, command), folder / "report.html")
     said = [", ".join(filter(None, [f"{s.name}: RMSE ratio {_interval(s.ratio, 1.0, 3)}", s.found])) for s in summaries]
     return Outcome((*said, f"written: stress.json, stress.md, report.html in {folder}"))

@@ -14,14 +14,16 @@ import pytest
 
 from factorgraph.errors import InputError
 from factorgraph.types import Array
-from scenarios.studies import aar_claims, aar_record, aar_summary
-from scenarios.studies.aar_claims import Verdict, claims
-from scenarios.studies.aar_summary import DEFAULT, GRAPH, Cell, JobKey, Statistic, Summary, from_json, summarise, to_json
+from scenarios.studies import aar_claims, aar_record, aar_summary, verdicts
+from scenarios.studies.aar_claims import claims
+from scenarios.studies.aar_summary import DEFAULT, GRAPH, Cell, JobKey, Summary, from_json, summarise, to_json
+from scenarios.studies.document import json_text
+from scenarios.studies.statistics import NAN, Statistic
+from scenarios.studies.verdicts import Claim, Verdict
 from tests.helpers import ROOT
 from tests.scenarios.aar_results import SUCCESS, MadeUp, made_up, trial
 
 N_SEEDS = 6
-NAN = float("nan")
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +32,7 @@ def summary() -> Summary:
     return summarise(MadeUp(made_up(N_SEEDS).keys_ + extra.keys_))
 
 
-def _claim(summary: Summary, id: str) -> aar_claims.Claim:
+def _claim(summary: Summary, id: str) -> Claim:
     (found,) = [claim for claim in claims(summary) if claim.id == id]
     return found
 
@@ -172,21 +174,21 @@ def test_nothing_run_is_an_empty_summary() -> None:
     ],
 )
 def test_verdict_of_a_number(found: Statistic, value: float, verdict: Verdict) -> None:
-    assert aar_claims.near(found, value, 3, 10) is verdict
+    assert verdicts.near(found, value, 3, 10) is verdict
 
 
 def test_verdicts_of_bounds_and_differences() -> None:
-    assert aar_claims.at_most(Statistic(1, 0.9, 1.1, 0, 2, 9), 1.2) is Verdict.REPRODUCED
-    assert aar_claims.at_most(Statistic(1, 0.9, 1.1, 0, 2, 9), 1.0) is Verdict.PARTLY
-    assert aar_claims.at_most(Statistic(1, NAN, NAN, 1, 1, 1), 0.4) is Verdict.NOT_REPRODUCED
-    assert aar_claims.positive(Statistic(1, 0.1, 2, 0, 3, 9)) is Verdict.REPRODUCED
-    assert aar_claims.positive(Statistic(1, -0.1, 2, 0, 3, 9)) is Verdict.PARTLY
-    assert aar_claims.positive(Statistic(1, NAN, NAN, 1, 1, 1)) is Verdict.PARTLY  # one seed proves nothing
-    assert aar_claims.positive(Statistic(-1, -2, -0.1, -3, 0, 9)) is Verdict.NOT_REPRODUCED
+    assert verdicts.at_most(Statistic(1, 0.9, 1.1, 0, 2, 9), 1.2) is Verdict.REPRODUCED
+    assert verdicts.at_most(Statistic(1, 0.9, 1.1, 0, 2, 9), 1.0) is Verdict.PARTLY
+    assert verdicts.at_most(Statistic(1, NAN, NAN, 1, 1, 1), 0.4) is Verdict.NOT_REPRODUCED
+    assert verdicts.positive(Statistic(1, 0.1, 2, 0, 3, 9)) is Verdict.REPRODUCED
+    assert verdicts.positive(Statistic(1, -0.1, 2, 0, 3, 9)) is Verdict.PARTLY
+    assert verdicts.positive(Statistic(1, NAN, NAN, 1, 1, 1)) is Verdict.PARTLY  # one seed proves nothing
+    assert verdicts.positive(Statistic(-1, -2, -0.1, -3, 0, 9)) is Verdict.NOT_REPRODUCED
     parts = (Verdict.REPRODUCED, Verdict.NOT_TESTED, Verdict.NOT_REPRODUCED)
-    assert aar_claims.together(parts) is Verdict.PARTLY
-    assert aar_claims.together(parts[:2]) is Verdict.REPRODUCED
-    assert aar_claims.together(()) is Verdict.NOT_TESTED
+    assert verdicts.together(parts) is Verdict.PARTLY
+    assert verdicts.together(parts[:2]) is Verdict.REPRODUCED
+    assert verdicts.together(()) is Verdict.NOT_TESTED
 
 
 @pytest.mark.parametrize(
@@ -235,7 +237,7 @@ def test_claims_turn_with_the_numbers(summary: Summary) -> None:
     good = changed("baseline_rms", (GRAPH,), 4, 0.011)
     assert _claim(changed("baseline_rms", (GRAPH,), 4, 0.2), "graph-4").verdict is Verdict.PARTLY
     assert _claim(good, "graph-4").verdict is Verdict.REPRODUCED and _claim(good, "graph-4").word == "met"
-    swapped = [replace(d, difference=aar_claims.negated(d.difference)) for d in summary.differences]
+    swapped = [replace(d, difference=verdicts.negated(d.difference)) for d in summary.differences]
     assert _claim(replace(summary, differences=tuple(swapped)), "order-data-3").verdict is Verdict.NOT_REPRODUCED
     assert _claim(replace(summary, sweep={}), "figure-7").verdict is Verdict.NOT_TESTED
     worse = [
@@ -273,8 +275,8 @@ def test_no_lower_is_not_higher(summary: Summary) -> None:
     assert _claim(even, "no-lower-3").verdict is Verdict.REPRODUCED
     assert _claim(even, "order-data-3").verdict is Verdict.NOT_REPRODUCED
     assert _claim(_without_gain(summary, ("4b", "5b"), value=-1.0), "no-lower-3").verdict is Verdict.PARTLY
-    assert aar_claims.at_least_zero(Statistic(0.5, -0.1, 1, -1, 2, 9)) is Verdict.PARTLY
-    assert aar_claims.at_least_zero(Statistic(-1, NAN, NAN, -1, -1, 1)) is Verdict.NOT_REPRODUCED
+    assert verdicts.at_least_zero(Statistic(0.5, -0.1, 1, -1, 2, 9)) is Verdict.PARTLY
+    assert verdicts.at_least_zero(Statistic(-1, NAN, NAN, -1, -1, 1)) is Verdict.NOT_REPRODUCED
 
 
 def test_advantages_of_robust_schemes_follow_from_the_numbers(summary: Summary) -> None:
@@ -302,9 +304,9 @@ def test_every_claim_has_its_own_name_and_says_what_is_missing() -> None:
 
 
 def test_numbers_in_words() -> None:
-    assert aar_claims.plain(-0.5) == "−0.5" and aar_claims.plain(12345.0) == "12300" and aar_claims.plain(NAN) == "–"
-    assert aar_claims.shown(Statistic(94.44, 93, 95.96, 90, 97, 9), "%", ".1f") == "94.4 % (93.0 to 96.0)"
-    assert aar_claims.shown(Statistic(0.05, NAN, NAN, 0.05, 0.05, 1), "cm", scale=100) == "5 cm"
+    assert verdicts.plain(-0.5) == "−0.5" and verdicts.plain(12345.0) == "12300" and verdicts.plain(NAN) == "–"
+    assert verdicts.shown(Statistic(94.44, 93, 95.96, 90, 97, 9), "%", ".1f") == "94.4 % (93.0 to 96.0)"
+    assert verdicts.shown(Statistic(0.05, NAN, NAN, 0.05, 0.05, 1), "cm", scale=100) == "5 cm"
 
 
 # record
@@ -315,7 +317,7 @@ def _page_of(content: Path) -> str:
 
 
 def test_summary_survives_json(summary: Summary) -> None:
-    text = aar_summary.json_text(to_json(summary))
+    text = json_text(to_json(summary))
     back = from_json(json.loads(text))
     assert to_json(back) == to_json(summary)
     assert [repr(claim) for claim in claims(back)] == [repr(claim) for claim in claims(summary)]

@@ -16,7 +16,6 @@ from scenarios import cli
 from scenarios.published import ahrs_tdo_filters
 from scenarios.published.ahrs_tdo_filters import CA_CV, FILTERS
 from scenarios.studies import ahrs_tdo
-from scenarios.studies.aar_claims import Claim, Verdict
 from scenarios.studies.ahrs_tdo import BOUND, GRID, OTHERS, RULES, SEARCHES, TUNING
 from scenarios.studies.ahrs_tdo_claims import PAPER_POSITION, PAPER_VELOCITY, claims
 from scenarios.studies.ahrs_tdo_record import markdown, tables
@@ -32,6 +31,7 @@ from scenarios.studies.ahrs_tdo_summary import (
     summarise,
 )
 from scenarios.studies.study import Job
+from scenarios.studies.verdicts import Claim, Verdict
 
 T = np.arange(601.0)
 SEEDS = (1, 2, 3, 4, 5, 6)
