@@ -11,6 +11,9 @@ from typing import Any
 from factorgraph.errors import InputError
 
 
+MOST_SHOWN, FIRST_SHOWN = 12, 8  # names in an error
+
+
 @dataclass(frozen=True, slots=True)
 class Named:
     """One choice."""
@@ -56,8 +59,11 @@ class Names:
                 return Named(name, f"{family.module}:{name}", family.summary)
         near = difflib.get_close_matches(name, [*known, *(n for family in self.families for n in family.names)], n=1)
         hint = f"; did you mean {near[0]}?" if near else "."
-        patterns = [family.pattern for family in self.families]
-        raise InputError(f"no {self.kind} named {name}{hint} There are: {', '.join([*known, *patterns])}")
+        shown = list(known)
+        if len(shown) > MOST_SHOWN:
+            shown = [*shown[:FIRST_SHOWN], f"{len(shown) - FIRST_SHOWN} more"]
+        listed = ", ".join([*shown, *(family.pattern for family in self.families)])
+        raise InputError(f"no {self.kind} named {name}{hint} There are: {listed}")
 
     def create(self, name: str) -> Any:
         """An instance by name. Raises InputError as `named`."""

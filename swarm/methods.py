@@ -117,6 +117,10 @@ def minimize(
 
     Raises ValueError for an unknown method or option, and for bounds, options or costs of a wrong shape or value.
     """
+    if not callable(cost):
+        raise ValueError(f"cost must be a function of points (k, n) or a CompiledCost, got {cost!r}")
+    if not isinstance(rng, np.random.Generator):
+        raise ValueError(f"rng must be a numpy.random.Generator, got {rng!r}")
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method}")
     chosen = METHODS[method]

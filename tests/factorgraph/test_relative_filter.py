@@ -268,7 +268,11 @@ def test_samples_that_do_not_cover_the_epochs_are_told(flown: tuple[Exact, Local
         AttitudeReferenced(movers(flown), np.array([0.0, 99.0]), np.zeros((2, 3)))
 
 
-def test_nearest_epochs() -> None:
-    assert rows.nearest_epoch(np.array([0.0, 1.0, 2.0]), np.array([0.0, 0.5, 1.001, 2.0])).tolist() == [0, -1, 1, 2]
-    assert rows.nearest_epoch(np.zeros(0), np.array([0.0])).tolist() == [-1]
-    assert rows.nearest_epoch(np.array([1.0]), np.array([0.0, 1.0])).tolist() == [-1, 0]
+def test_every_time_belongs_to_one_epoch() -> None:
+    times = np.array([0.0, 1.0, 1.0011, 2.0, 2.0021, 2.0041, 3.0])
+    epochs = rows.epochs_of(times[::-1])
+    assert epochs.tolist() == [0.0, 1.0, 2.0, 2.0021, 3.0]
+    assert rows.epoch_of(times, epochs).tolist() == [0, 1, 1, 2, 3, 3, 4]
+    assert rows.epoch_of(np.array([-0.1, 0.5, 9.0]), epochs).tolist() == [-1, -1, -1]
+    assert rows.measured_at(np.array([1.0011, 2.0021]), epochs).tolist() == [-1, 0, -1, 1, -1]
+    assert rows.measured_at(np.zeros(0), epochs).tolist() == [-1] * 5

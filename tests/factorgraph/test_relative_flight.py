@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +14,10 @@ from factorgraph.filters.relative.flight import Configuration, Formation, prepar
 from factorgraph.filters.relative.motion import position, velocity
 from factorgraph.filters.relative.own import own_motions
 from factorgraph.models.receivers import receivers
-from factorgraph.problem import NavigationProblem
+from factorgraph.problem import Link, NavigationProblem
 from factorgraph.registry import solve
 from factorgraph.solution import Status
-from factorgraph.types import Array
+from factorgraph.types import Array, BoolArray
 from scenarios.published import ahrs_tdo
 from scenarios.simulate import simulate
 from tests.helpers import numerical_jacobian
@@ -48,7 +49,7 @@ def true_states(formation: Formation, k: int, n: int) -> Array:
     x = np.zeros(n)
     for i, name in enumerate(formation.names[1:]):
         true = truth_of(formation, formation.names[0], name)
-        assert true is not None
+        assert true is not None and true[1] is not None
         x[position(i)], x[velocity(i)] = true[0][k], true[1][k]
     return x
 
@@ -98,7 +99,7 @@ def test_without_noise_the_truth_comes_back(exact: Formation) -> None:
     for a, b in ((0, 1), (0, 2), (1, 2)):
         r, v, P = track.pair(a, b)
         true = truth_of(exact, exact.names[a], exact.names[b])
-        assert true is not None
+        assert true is not None and true[1] is not None
         assert np.linalg.norm(r[-1] - true[0][-1]) < 0.02 and np.linalg.norm(v[-1] - true[1][-1]) < 2e-3
         assert np.linalg.eigvalsh(P[-1]).min() > 0
 
@@ -140,13 +141,83 @@ def test_what_cannot_be_done_is_told(noisy: NavigationProblem) -> None:
     with pytest.raises(InputError, match="no measurements called carrier; there are code, doppler"):
         Configuration(kinds=("carrier",))
     alone = replace(noisy, vehicles=noisy.vehicles[:1], links=(), ranges=())
-    with pytest.raises(InputError, match="two moving vehicles or anchors; there is leader"):
+    with pytest.raises(InputError, match="two moving vehicles, a base or anchors; there is leader"):
         prepare(alone, own_motions(alone, {}), {})
 
 
-def test_times_beside_the_epochs_are_left_out() -> None:
-    epochs = np.array([0.0, 0.5, 1.0])
-    assert flight._epoch_of(np.array([-0.1, 0.0, 0.501, 0.7, 1.0, 2.0]), epochs).tolist() == [-1, 0, 1, -1, 2, -1]
+@pytest.mark.parametrize("late_s", [0.0009, 0.0011, 0.0021])
+def test_no_measurement_counts_twice_where_clocks_differ(noisy: NavigationProblem, late_s: float) -> None:
+    """Ranges a little after GNSS: one epoch or two, but the same rows."""
+    model = noisy.ranges[0]
+    later = replace(model, stream=replace(model.stream, t_s=model.stream.t_s + late_s))
+    counts = []
+    for problem in (noisy, replace(noisy, ranges=(later,))):
+        found = formation_of(problem).run(Configuration(kinds=("code", "doppler", "range")))
+        counts.append(int(np.sum(found.n_rows)))
+    assert counts[0] - 1 <= counts[1] <= counts[0]  # the last range may fall behind the IMU's end
+
+
+def last_errors(problem: NavigationProblem) -> list[float]:
+    """Of every pair [m]."""
+    formation = formation_of(problem)
+    track = formation.run(Configuration(kinds=("code", "doppler", "range")))
+    out = []
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        true = truth_of(formation, formation.names[a], formation.names[b])
+        assert true is not None
+        out.append(float(np.linalg.norm(track.pair(a, b)[0][-1] - true[0][-1])))
+    return out
+
+
+def test_whatever_ends_links_have_followers_are_differenced_against_the_reference() -> None:
+    problem = flown(3, 1.0, duration_s=40.0)
+    a, b, c = (v.name for v in problem.vehicles)
+    for links in ([(a, b), (b, c)], [(a, c), (b, c)], [(c, a), (c, b)]):
+        chain = replace(problem, links=tuple(Link(x, y) for x, y in links), pairs=(Link(a, c),))
+        formation = formation_of(chain)
+        assert len(formation.links) == 2 and formation.names[0] in links[0] and formation.names[0] in links[1]
+        assert max(last_errors(chain)) < 4.0
+    without = replace(problem, links=())
+    assert not formation_of(without).links and max(last_errors(without)) < 8.0  # absolute differences instead
+
+
+def test_a_base_station_may_be_the_reference() -> None:
+    scene = ahrs_tdo.scenario(n=2)
+    info = scene.scenario.model_copy(update={"duration_s": 30.0})
+    tables = [v.model_dump(exclude_none=True) for v in scene.vehicle]
+    base = {
+        "name": "base",
+        "trajectory": {"kind": "static", "r_n": (0.0, 0.0, 900.0)},
+        "gnss": tables[0]["gnss"],
+        "is_base": True,
+    }
+    links = [{"reference": "base", "rover": "leader"}, {"reference": "base", "rover": "follower"}]
+    whole = type(scene).model_validate(
+        scene.model_dump(exclude_none=True)
+        | {"scenario": info.model_dump(exclude_none=True), "vehicle": [base, *tables], "link": links}
+        | {"pair": [{"reference": "leader", "rover": "follower"}]}
+    )
+    solution = solve(ahrs_tdo.without_phases(simulate(whole, 3).problem), "relative")
+    pair = solution.pair("leader", "follower")
+    assert "reference of the filter: base" in solution.diagnostics.notes
+    assert pair.truth_enu is not None and np.linalg.norm(pair.baseline_enu[-1] - pair.truth_enu[-1]) < 4.0
+
+
+def test_attitudes_that_end_early_or_have_a_gap_are_told(noisy: NavigationProblem) -> None:
+    def with_attitudes(keep: Callable[[Array], BoolArray]) -> NavigationProblem:
+        out = []
+        for v in noisy.vehicles:
+            stream = v.attitudes[0]
+            rows_kept = keep(stream.t_s)
+            cut = replace(stream, t_s=stream.t_s[rows_kept], q_nb=stream.q_nb[rows_kept], sigma_rad=stream.sigma_rad[rows_kept])
+            out.append(replace(v, attitudes=(cut,)))
+        return replace(noisy, vehicles=tuple(out))
+
+    solution = solve(with_attitudes(lambda t: t < 30.0), "relative")
+    assert solution.pairs[0].t_s[-1] < 30.1
+    assert any("IMUs and attitudes of all vehicles cover" in warning for warning in solution.diagnostics.warnings)
+    with pytest.raises(InputError, match=r"vehicle leader: its attitudes ahrs are missing from 19\.\d+ to 25\.\d+ s"):
+        solve(with_attitudes(lambda t: (t < 20.0) | (t > 25.0)), "relative")
 
 
 ANCHORS = np.array([[5.0, 5.0, 2.0], [5.0, -5.0, 2.1], [-5.0, -5.0, 1.9], [-5.0, 5.0, 2.2]])
@@ -158,9 +229,9 @@ def standing(true: Array, sigma: float, n_epochs: int = 6) -> dict[int, list[row
     out: dict[int, list[rows.RangeRow]] = {}
     for k in range(n_epochs):
         found = [
-            rows.RangeRow(0, i + 1, -a, float(np.linalg.norm(true[i] - a) + sigma * rng.normal()), 0.1, "a")
+            rows.RangeRow(0, i + 1, -a, float(np.linalg.norm(true[i] - a) + sigma * rng.normal()), 0.1, f"{j}-{i}")
             for i in (0, 1)
-            for a in ANCHORS
+            for j, a in enumerate(ANCHORS)
         ]
         found.append(rows.RangeRow(1, 2, np.zeros(3), float(np.linalg.norm(true[1] - true[0])), 0.1, "b"))
         out[k] = found
@@ -182,6 +253,9 @@ def test_followers_are_placed_by_ranges_and_the_first_height_tells_up_from_down(
 
 
 def test_too_few_ranges_place_nothing() -> None:
-    few = {0: [rows.RangeRow(0, 1, -ANCHORS[0], 5.0, 0.1, "a")]}
-    with pytest.raises(InputError, match=r"vehicle a: 1 ranges until 3\.0 s, too few to place it"):
+    few = {0: 3 * [rows.RangeRow(0, 1, -ANCHORS[0], 5.0, 0.1, "a")]}
+    with pytest.raises(InputError, match=r"vehicle a: ranges to 1 tags until 3\.0 s, too few to place it"):
         start.placed(few, {}, np.zeros(1), (flight.GROUND, "a"), None)
+    among = {0: [rows.RangeRow(1, 2, np.zeros(3), 5.0, 0.1, name) for name in "abc"]}
+    with pytest.raises(InputError, match=r"ranges to 0 anchors until 3\.0 s"):
+        start.placed(among, {}, np.zeros(1), (flight.GROUND, "a", "b"), None)

@@ -246,3 +246,11 @@ def test_modules_offer_what_the_names_stand_for() -> None:
     assert same(run("pso-ring", sphere), pso.minimize(sphere, box(3), rng=rng(3), max_evals=1500, topology="ring"))
     assert same(run("tdo-chase-all", sphere), tdo.minimize(sphere, box(3), rng=rng(3), max_evals=1500, chase_all=True))
     assert all(method.summary and method.source for method in swarm.METHODS.values())
+
+
+def test_what_is_no_cost_or_generator_is_told() -> None:
+    box = [[-1.0, 1.0]]
+    with pytest.raises(ValueError, match=r"rng must be a numpy.random.Generator, got 3"):
+        swarm.minimize("pso", lambda x: x[:, 0], box, rng=3)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"cost must be a function of points .*, got 1\.0"):
+        swarm.minimize("pso", 1.0, box, rng=np.random.default_rng(0))  # type: ignore[arg-type]

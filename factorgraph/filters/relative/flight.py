@@ -4,10 +4,12 @@
     epochs      times of GNSS, ranges and heights, and between them so that no step is longer than LONGEST_STEP_S
     rows        double differences against the reference, absolute differences, ranges, heights
 
-The reference is that of the first link. Without links it is the first vehicle; where anchors are heard, the ground at the origin
-of n: every vehicle is then a follower of it, and pairs are differences of followers. What the filter is told is the problem's:
-noise of receivers, IMUs and ranges. Scales and biases that the problem lets ranges have are constants of the filter where asked
-(`Configuration.calibrate_ranges`); the source estimates neither.
+The reference is the vehicle or base station that most links touch, of those the first. All followers with a receiver are
+differenced against it, whatever ends their links have: pairs are differences of followers. Where that fails, and without links, a
+follower has absolute differences instead, which then say nothing twice. Without links the reference is the first vehicle; where
+anchors are heard, the ground at the origin of n. What the filter is told is the problem's: noise of receivers, IMUs and ranges.
+Scales and biases that the problem lets ranges have are constants of the filter where asked (`Configuration.calibrate_ranges`);
+the source estimates neither.
 
 `prepare` does what all configurations share, `Formation.run` filters. Source: Lu et al. (2024); spec ahrs_tdo.md, sections 1,
 2.7 and 2.8.
@@ -48,7 +50,9 @@ from factorgraph.filters.relative.rows import (
     RangeRow,
     Source,
     arms,
-    nearest_epoch,
+    epoch_of,
+    epochs_of,
+    measured_at,
 )
 from factorgraph.filters.relative.start import placed, rest_until
 from factorgraph.geodesy import LocalFrame
@@ -56,9 +60,9 @@ from factorgraph.grid import subdivided
 from factorgraph.measurements import Tag
 from factorgraph.models.double_differences import PairEpochs, pair_epochs
 from factorgraph.models.receivers import Receiver
-from factorgraph.problem import NavigationProblem, RangeModel, Vehicle
+from factorgraph.problem import NavigationProblem, RangeModel
 from factorgraph.sampling import interpolate
-from factorgraph.types import Array, IntArray
+from factorgraph.types import Array
 
 GROUND = "the ground"  # as a reference
 LONGEST_STEP_S = 1.0
@@ -127,6 +131,7 @@ class Formation:
     constants: tuple[float, ...]  # of ranges: prior standard deviations of scales and biases
     heights: dict[int, list[HeightRow]]
     notes: tuple[str, ...]
+    warnings: tuple[str, ...]  # what makes its solutions degraded
 
     def run(
         self, configuration: Configuration, correct: Correct | None = None, observe: Callable[[int, Update], None] | None = None
@@ -150,8 +155,11 @@ class Formation:
         sources: list[Source] = []
         if self.links and {"code", "doppler"} & set(c.kinds):
             sources.append(CodeAndRate(self.links, self.noise, self.places, self.problem.frame, self.t_s, self.names, n, c.kinds))
+        alone = [i for i in range(len(self.names) - 1) if i not in self.links]
         if "position" in c.kinds:
             sources.append(AbsoluteDifferences(*self.absolute, self.names, n, c.absolute_factor))
+        elif alone:
+            sources.append(AbsoluteDifferences(*self.absolute, self.names, n, 1.0, alone))
         if "range" in c.kinds:
             first = n - len(self.constants) if c.calibrate_ranges else None
             sources.append(Distances(self.ranges, n, c.range_scale, first))
@@ -188,28 +196,26 @@ def prepare(problem: NavigationProblem, motions: Mapping[str, OwnMotion], receiv
 
     Raises InputError where there is nothing to filter, or where a vehicle's samples do not cover the epochs.
     """
-    moving = [v for v in problem.bodies if not v.is_fixed]
-    anchored = any(tag.position_n is not None for model in problem.ranges for tag in model.stream.tags)
-    names = _order(problem, moving, anchored and not problem.links)
-    missing = [name for name in names if name != GROUND and name not in motions]
+    names = _order(problem)
+    first = problem.vehicle(names[0]) if names[0] != GROUND else None
+    stands = first is None or first.is_fixed
+    missing = [name for name in names[1 if stands else 0 :] if name not in motions]
     if missing:
         raise InputError(f"vehicle {missing[0]}: the relative filter needs its attitude and specific force, so an IMU")
     frame = problem.frame
-    links = {
-        names.index(k.rover) - 1: pair_epochs(receivers[k.reference], receivers[k.rover], problem.settings, needs_phase=False)
-        for k in problem.links
-        if k.reference == names[0] and k.rover in names and {k.reference, k.rover} <= set(receivers)
-    }
-    t_s = _epochs(problem, names, motions, links)
-    full = {name: motions[name] for name in names if name != GROUND}
-    if names[0] == GROUND:
-        full[GROUND] = _ground(frame, t_s)
+    links, notes = _links(problem, names, receivers)
+    t_s, warnings = _epochs(problem, names, motions, links)
+    full = {name: motions[name] for name in names if name in motions}
+    origin_n = None
+    if stands:
+        origin_n = np.zeros(3) if first is None else np.asarray(first.fixed_n, float)
+        full[names[0]] = _standing(frame, t_s, origin_n)
     at = [_held(full[name], t_s, frame) for name in names]
     levers = [receivers[name].lever_b if name in receivers else (0.0, 0.0, 0.0) for name in names]
     turning = [arms(C, w, np.asarray(lever)) for (_, _, C, w), lever in zip(at, levers, strict=True)]
     places = Places(at[0][0], at[0][1], np.array([a for a, _ in turning]), np.array([v for _, v in turning]))
     movers = tuple(_mover(name, full[name], frame) for name in names)
-    ranges, constants, skipped = _ranges(problem, names, t_s, [C for _, _, C, _ in at], frame)
+    ranges, constants, skipped = _ranges(problem, names, t_s, [C for _, _, C, _ in at], origin_n)
     return Formation(
         problem=problem,
         names=names,
@@ -224,44 +230,77 @@ def prepare(problem: NavigationProblem, motions: Mapping[str, OwnMotion], receiv
         ranges=ranges,
         constants=constants,
         heights=_heights(problem, names, t_s) if names[0] == GROUND else {},
-        notes=(f"{skipped} ranges to tags that this filter does not place were left out",) if skipped else (),
+        notes=(*notes, *((f"{skipped} ranges to tags that this filter does not place were left out",) if skipped else ())),
+        warnings=warnings,
     )
 
 
-def _order(problem: NavigationProblem, moving: Sequence[Vehicle], on_ground: bool) -> tuple[str, ...]:
-    """Names, the reference first."""
-    names = [v.name for v in moving]
-    if on_ground:
-        return (GROUND, *names)
+def _order(problem: NavigationProblem) -> tuple[str, ...]:
+    """Names of what has relative states, the reference first."""
+    moving = [v.name for v in problem.bodies if not v.is_fixed]
+    touched = [end for link in problem.links for end in (link.reference, link.rover)]
+    bodies = [v.name for v in problem.bodies]
+    candidates = sorted(
+        {name for name in touched if name in bodies}, key=lambda name: (-touched.count(name), touched.index(name))
+    )
+    if candidates:
+        first = candidates[0]
+    elif any(tag.position_n is not None for model in problem.ranges for tag in model.stream.tags):
+        first = GROUND
+    else:
+        first = moving[0] if moving else ""
+    names = (first, *(name for name in moving if name != first))
     if len(names) < 2:
-        raise InputError(f"a relative filter needs two moving vehicles or anchors; there is {names[0] if names else 'none'}")
-    first = problem.links[0].reference if problem.links and problem.links[0].reference in names else names[0]
-    return (first, *(name for name in names if name != first))
+        raise InputError(f"a relative filter needs two moving vehicles, a base or anchors; there is {names[0] or 'none'}")
+    return names
+
+
+def _links(
+    problem: NavigationProblem, names: Sequence[str], receivers: Mapping[str, Receiver]
+) -> tuple[dict[int, PairEpochs], list[str]]:
+    """Differences of every follower against the reference, by follower, and what cannot be had."""
+    found: dict[int, PairEpochs] = {}
+    notes: list[str] = []
+    if not problem.links or names[0] not in receivers:
+        return found, notes
+    for i, name in enumerate(names[1:]):
+        if name in receivers:
+            try:
+                found[i] = pair_epochs(receivers[names[0]], receivers[name], problem.settings, needs_phase=False)
+            except InputError as error:
+                notes.append(f"not differenced: {error}")
+    return found, notes
 
 
 def _epochs(
     problem: NavigationProblem, names: Sequence[str], motions: Mapping[str, OwnMotion], links: Mapping[int, PairEpochs]
-) -> Array:
-    """Times (K,) of measurements, merged within MATCH_S, with others between them."""
+) -> tuple[Array, tuple[str, ...]]:
+    """Times (K,) of measurements, merged within MATCH_S, with others between them; and what lies outside IMUs and attitudes."""
     times = [pair.t_rover_s for pair in links.values()]
     times += [model.stream.t_s for model in problem.ranges]
     times += [h.t_s for v in problem.vehicles for h in v.heights]
     times += [track.t_s for name in names if name in motions and (track := motions[name].track) is not None]
-    wanted = np.unique(np.round(np.concatenate([np.zeros(0), *times]) / MATCH_S) * MATCH_S)
-    first = max(motions[name].edges[0] for name in names if name in motions)
-    last = min(motions[name].edges[-1] for name in names if name in motions)
-    wanted = wanted[(wanted >= first - 1e-6) & (wanted <= last + 1e-6)]
-    if len(wanted) < 2:
+    wanted = epochs_of(np.concatenate([np.zeros(0), *times]))
+    mine = [name for name in names if name in motions]
+    first, last = max(motions[name].edges[0] for name in mine), min(motions[name].edges[-1] for name in mine)
+    inside = wanted[(wanted >= first - 1e-6) & (wanted <= last + 1e-6)]
+    if len(inside) < 2:
         raise InputError(f"no measurements between {first:.1f} and {last:.1f} s, where all vehicles have IMU and attitude")
-    return subdivided(wanted, LONGEST_STEP_S)
+    lost = int(np.sum(np.abs(wanted - np.clip(wanted, first, last)) > LONGEST_STEP_S))
+    warnings = (
+        (f"{lost} epochs are left out: IMUs and attitudes of all vehicles cover {first:.1f} to {last:.1f} s only",)
+        if lost
+        else ()
+    )
+    return subdivided(inside, LONGEST_STEP_S), warnings
 
 
-def _ground(frame: LocalFrame, t_s: Array) -> OwnMotion:
-    """A reference that stands at the origin of n."""
+def _standing(frame: LocalFrame, t_s: Array, place_n: Array) -> OwnMotion:
+    """A reference that stands on the ground."""
     edges = np.array([t_s[0] - 1.0, t_s[-1] + 1.0])
-    w = frame.w_ie_n[None]
-    track = OwnTrack(t_s, np.zeros((len(t_s), 3)), np.zeros((len(t_s), 3)), np.zeros((len(t_s), 6, 6)))
-    return OwnMotion(edges, -frame.gravity(np.zeros((1, 3))), w, np.eye(3)[None], PERFECT, track)
+    none = np.zeros((len(t_s), 3))
+    track = OwnTrack(t_s, none + place_n, none, np.zeros((len(t_s), 6, 6)))
+    return OwnMotion(edges, -frame.gravity(place_n[None]), frame.w_ie_n[None], np.eye(3)[None], PERFECT, track)
 
 
 def _held(own: OwnMotion, t_s: Array, frame: LocalFrame) -> tuple[Array, Array, Array, Array]:
@@ -287,7 +326,7 @@ def _absolute(tracks: Sequence[OwnTrack | None], t_s: Array, frame: LocalFrame) 
     turn = np.kron(np.eye(2), frame.C_en.T)
     for i, track in enumerate(tracks):
         if track is not None:
-            at = nearest_epoch(track.t_s, t_s)
+            at = measured_at(track.t_s, t_s)
             has = at >= 0
             r_e[i, has], v_e[i, has] = frame.to_ecef(track.r_n[at[has]]), frame.rotate_to_ecef(track.v_n[at[has]])
             P[i, has] = turn @ track.P[at[has]] @ turn.T
@@ -295,18 +334,21 @@ def _absolute(tracks: Sequence[OwnTrack | None], t_s: Array, frame: LocalFrame) 
 
 
 def _ranges(
-    problem: NavigationProblem, names: Sequence[str], t_s: Array, C_eb: Sequence[Array], frame: LocalFrame
+    problem: NavigationProblem, names: Sequence[str], t_s: Array, C_eb: Sequence[Array], origin_n: Array | None
 ) -> tuple[dict[int, list[RangeRow]], tuple[float, ...], int]:
-    """Ranges by epoch, sigmas of their constants, and how many are left out because an end is not placed."""
+    """Ranges by epoch, sigmas of their constants, and how many are left out because an end is not placed.
+
+    origin_n: where a reference that stands is, whose axes are those of n.
+    """
     found: dict[int, list[RangeRow]] = {}
     constants: list[float] = []
     skipped = 0
     for model in problem.ranges:
         stream = model.stream
-        places = [_place(tag, names) for tag in stream.tags]
+        places = [_place(tag, names, origin_n) for tag in stream.tags]
         numbers: dict[tuple[str, int, int], int] = {}
         for k, a, b, range_m, sigma_m in zip(
-            _epoch_of(stream.t_s, t_s), stream.tag_a, stream.tag_b, stream.range_m, stream.sigma_m, strict=True
+            epoch_of(stream.t_s, t_s), stream.tag_a, stream.tag_b, stream.range_m, stream.sigma_m, strict=True
         ):
             if k < 0:
                 continue
@@ -340,12 +382,12 @@ def _constant(
     return numbers[key]
 
 
-def _place(tag: Tag, names: Sequence[str]) -> tuple[int, Array] | None:
-    """A tag's vehicle and lever arm; an anchor is one of the ground's. None where this filter does not place it."""
+def _place(tag: Tag, names: Sequence[str], origin_n: Array | None) -> tuple[int, Array] | None:
+    """A tag's vehicle and lever arm; an anchor is one of a reference that stands at origin_n. None where nothing places it."""
     if tag.vehicle is not None and tag.vehicle in names:
         return names.index(tag.vehicle), np.asarray(tag.lever_b, float)
-    if tag.position_n is not None and names[0] == GROUND:
-        return 0, np.asarray(tag.position_n, float)
+    if tag.position_n is not None and origin_n is not None:
+        return 0, np.asarray(tag.position_n, float) - origin_n
     return None
 
 
@@ -355,16 +397,10 @@ def _heights(problem: NavigationProblem, names: Sequence[str], t_s: Array) -> di
     up = problem.frame.C_en[2]
     for i, name in enumerate(names[1:]):
         for stream in problem.vehicle(name).heights:
-            for k, height, sigma in zip(_epoch_of(stream.t_s, t_s), stream.up_m, stream.sigma_m, strict=True):
+            for k, height, sigma in zip(epoch_of(stream.t_s, t_s), stream.up_m, stream.sigma_m, strict=True):
                 if k >= 0:
                     found.setdefault(int(k), []).append(HeightRow(i, up, float(height), float(sigma), f"{name}/{stream.name}"))
     return found
-
-
-def _epoch_of(t_s: Array, epochs_s: Array) -> IntArray:
-    """Of each time (n,) the epoch it belongs to, -1 for those before the first or after the last."""
-    near = np.clip(np.searchsorted(epochs_s, t_s - MATCH_S), 0, len(epochs_s) - 1)
-    return np.where(np.abs(epochs_s[near] - t_s) <= MATCH_S, near, -1)
 
 
 def truth_of(formation: Formation, reference: str, rover: str) -> tuple[Array, Array | None] | None:

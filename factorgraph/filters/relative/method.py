@@ -19,7 +19,7 @@ from factorgraph.errors import InputError
 from factorgraph.filters.relative.filtering import Correct, RelativeTrack, Update
 from factorgraph.filters.relative.flight import GROUND, Configuration, Formation, prepare, truth_of
 from factorgraph.filters.relative.own import own_motions
-from factorgraph.filters.relative.rows import KINDS, nearest_epoch
+from factorgraph.filters.relative.rows import KINDS, measured_at
 from factorgraph.geodesy import C_en, geodetic_from_ecef
 from factorgraph.models.receivers import receivers
 from factorgraph.problem import Link, NavigationProblem
@@ -105,8 +105,8 @@ def solution(
     pairs = tuple(
         _pair(formation, track, link) for link in problem.wanted_pairs if {link.reference, link.rover} <= set(formation.names)
     )
-    if not pairs:
-        raise InputError("none of the pairs wanted is one of vehicles that move")
+    if problem.wanted_pairs and not pairs:
+        raise InputError("none of the pairs wanted is one of vehicles that the relative filter places")
     has = track.n_rows > 0
     replaced = int(np.sum(track.triggered))
     notes = [*formation.notes, f"reference of the filter: {formation.names[0]}"]
@@ -129,6 +129,7 @@ def solution(
             nis_t_s=track.t_s[has],
             nis=track.nis[has],
             nis_dof=track.n_rows[has].astype(float),
+            warnings=formation.warnings,
             notes=tuple(notes),
         ),
         configuration=configuration(problem),
@@ -166,7 +167,7 @@ def _satellites(formation: Formation, vehicles: set[int]) -> IntArray:
     used = [formation.links[i - 1] for i in vehicles if i - 1 in formation.links]
     counts = []
     for pair in used:
-        at = nearest_epoch(pair.t_rover_s, formation.t_s)
+        at = measured_at(pair.t_rover_s, formation.t_s)
         counts.append(np.where(at >= 0, np.sum(pair.usable, axis=1)[at], 0))
     return np.min(counts, axis=0) if counts else np.zeros(len(formation.t_s), np.int64)
 
@@ -191,7 +192,8 @@ def _vehicle(formation: Formation, track: RelativeTrack, i: int) -> VehicleSolut
     P[:, :6, :6] = P6
     unknown = np.full((len(t_s), 3), np.nan)
     q = quat_from_matrix(frame.C_en @ mover.C_eb[sample])
-    return VehicleSolution(name, t_s, r_n, v_n, q, unknown, unknown, P, formation.problem.vehicle(name).truth)
+    told = formation.problem.vehicle(name)
+    return VehicleSolution(name, t_s, r_n, v_n, q, unknown, unknown, P, told.truth, told.is_fixed)
 
 
 HONEST = Configuration(

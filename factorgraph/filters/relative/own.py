@@ -18,7 +18,7 @@ from factorgraph.attitude import matrix_from_quat
 from factorgraph.errors import InputError
 from factorgraph.filters import ahrs, tightly_coupled
 from factorgraph.filters.ahrs import AhrsSettings, Aiding
-from factorgraph.filters.inertial import INERTIAL, ImuModel
+from factorgraph.filters.inertial import INERTIAL, LONGEST_GAP_S, ImuModel
 from factorgraph.filters.relative.flight import OwnMotion, OwnTrack, attitude_at
 from factorgraph.filters.relative.motion import AccelModel
 from factorgraph.filters.tightly_coupled import TightSettings, TightTrack, point_start
@@ -63,6 +63,7 @@ def own_motion(problem: NavigationProblem, vehicle: Vehicle, receiver: Receiver 
     assert vehicle.imu is not None
     edges, f, w = sample_means(vehicle.imu)
     attitude, correlation_s = _attitude(problem, vehicle, receiver, settings)
+    edges, f, w = _covered(vehicle, edges, f, w, attitude)
     C = attitude_at(attitude.t_s, attitude.q_nb, 0.5 * (edges[1:] + edges[:-1]))
     noise = vehicle.imu_noise
     steady = _steady_sigma(attitude, correlation_s)
@@ -93,6 +94,26 @@ def _attitude(
     tuned = settings.ahrs if aiding is None else settings.aided_ahrs
     track = ahrs.run(vehicle.imu, vehicle.imu_noise, problem.frame, magnetics, aiding, tuned, heading)
     return track.stream(settings.ahrs_s), settings.ahrs_s
+
+
+def _covered(vehicle: Vehicle, edges: Array, f: Array, w: Array, attitude: AttitudeStream) -> tuple[Array, Array, Array]:
+    """The samples of an IMU between the first and the last attitude. Raises InputError where attitudes are missing in between."""
+    step = np.diff(attitude.t_s)
+    gap = int(np.argmax(step))
+    if step[gap] > LONGEST_GAP_S:
+        raise InputError(
+            f"vehicle {vehicle.name}: its attitudes {attitude.name} are missing from {attitude.t_s[gap]:.3f} to "
+            f"{attitude.t_s[gap + 1]:.3f} s; the relative filter bridges {LONGEST_GAP_S:g} s"
+        )
+    usual = float(np.median(step))
+    inside = (edges[:-1] >= attitude.t_s[0] - usual) & (edges[1:] <= attitude.t_s[-1] + usual)
+    kept = np.flatnonzero(inside)
+    if not len(kept):
+        raise InputError(
+            f"vehicle {vehicle.name}: its IMU runs from {edges[0]:.1f} to {edges[-1]:.1f} s, its attitudes {attitude.name} from "
+            f"{attitude.t_s[0]:.1f} to {attitude.t_s[-1]:.1f} s; check time systems and offsets"
+        )
+    return edges[kept[0] : kept[-1] + 2], f[kept[0] : kept[-1] + 1], w[kept[0] : kept[-1] + 1]
 
 
 def _aiding(problem: NavigationProblem, receiver: Receiver) -> Aiding | None:

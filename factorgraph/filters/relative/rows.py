@@ -32,7 +32,8 @@ from factorgraph.types import Array, BoolArray, IntArray
 
 KINDS = ("code", "doppler", "position", "velocity", "range", "height")
 CODE, DOPPLER, POSITION, VELOCITY, RANGE, HEIGHT = range(len(KINDS))
-MATCH_S = 2e-3  # measurements this near to each other belong to one epoch
+MATCH_S = 2e-3  # measurements within this of an epoch's first one belong to it
+ROUNDING_S = 1e-7
 FEWEST = 2  # satellites of a difference
 
 
@@ -108,14 +109,28 @@ def stacked(parts: Sequence[Rows]) -> Rows:
     )
 
 
-def nearest_epoch(t_s: Array, epochs_s: Array) -> IntArray:
-    """Of each epoch (K,) the index into t_s (n,) of what belongs to it, -1 without."""
-    if not len(t_s):
-        return np.full(len(epochs_s), -1)
-    after = np.clip(np.searchsorted(t_s, epochs_s), 1, max(len(t_s) - 1, 1))
-    near = np.where(epochs_s - t_s[after - 1] <= t_s[np.minimum(after, len(t_s) - 1)] - epochs_s, after - 1, after)
-    near = np.minimum(near, len(t_s) - 1)
-    return np.where(np.abs(t_s[near] - epochs_s) <= MATCH_S, near, -1)
+def epochs_of(t_s: Array) -> Array:
+    """Epochs (K,) of measurement times (n,) in any order: an epoch holds what follows its first one within MATCH_S."""
+    out: list[float] = []
+    for t in np.unique(t_s).tolist():
+        if not out or t > out[-1] + MATCH_S + ROUNDING_S:
+            out.append(t)
+    return np.array(out)
+
+
+def epoch_of(t_s: Array, epochs_s: Array) -> IntArray:
+    """Of each time (n,) the one epoch that it belongs to, -1 for times that none holds."""
+    k = np.searchsorted(epochs_s, t_s + ROUNDING_S, side="right") - 1
+    inside = (k >= 0) & (t_s <= epochs_s[np.maximum(k, 0)] + MATCH_S + ROUNDING_S)
+    return np.where(inside, k, -1)
+
+
+def measured_at(t_s: Array, epochs_s: Array) -> IntArray:
+    """Of each epoch (K,) the index into times (n,) of what belongs to it, -1 without; each time serves one epoch."""
+    out = np.full(len(epochs_s), -1)
+    k = epoch_of(t_s, epochs_s)
+    out[k[k >= 0]] = np.flatnonzero(k >= 0)
+    return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +231,7 @@ class _Link:
         )
         sat = frame.to_ecef(np.array([pair.sat_reference, pair.sat_rover]))
         speed = frame.rotate_to_ecef(np.array([pair.vel_reference, pair.vel_rover]))
-        return cls(pair, nearest_epoch(pair.t_rover_s, epochs_s), sat, speed, code, doppler)
+        return cls(pair, measured_at(pair.t_rover_s, epochs_s), sat, speed, code, doppler)
 
 
 def _sight_rates(sat: Array, speed: Array, middle: Array, v: Array) -> Array:
@@ -232,15 +247,19 @@ class AbsoluteDifferences:
     """Positions and velocities of the vehicles' own filters, follower less reference.
 
     r_e, v_e (N, K, 3) ECEF and P (N, K, 6, 6) of position and velocity; NaN where a vehicle has none. `factor` multiplies the
-    covariance, see above.
+    covariance, see above. `only`: followers used.
     """
 
-    def __init__(self, r_e: Array, v_e: Array, P: Array, names: tuple[str, ...], n: int, factor: float = 4.0) -> None:
+    def __init__(
+        self, r_e: Array, v_e: Array, P: Array, names: tuple[str, ...], n: int, factor: float = 4.0,
+        only: Collection[int] | None = None,
+    ) -> None:  # fmt: skip
+        self.only = range(len(r_e) - 1) if only is None else only
         self.r_e, self.v_e, self.P, self.names, self.n, self.factor = r_e, v_e, P, names, n, factor
         self.known: BoolArray = np.isfinite(np.concatenate([r_e, v_e, P.reshape(*r_e.shape[:2], 36)], axis=2)).all(axis=2)
 
     def rows(self, k: int, x: Array) -> Rows | None:
-        followers = [i for i in range(len(self.r_e) - 1) if self.known[i + 1, k]]
+        followers = [i for i in self.only if self.known[i + 1, k]]
         if not self.known[0, k] or not followers:
             return None
         m = len(followers)

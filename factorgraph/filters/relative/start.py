@@ -24,6 +24,7 @@ MOVING_S = 3.0  # of ranges used without rest
 SPEED_MPS = (0.1, 5.0)  # how fast the followers may be, at rest and not
 HEIGHT_SIGMA_M = 1.0  # of the first height, which may be read after take-off
 STARTS = 12
+FEWEST = 3  # tags that place something
 UNKNOWN_M = 100.0  # standard deviation of what ranges do not tell
 ROBUST_SIGMAS = 2.0  # ranges further off count less
 
@@ -49,7 +50,7 @@ def placed(
 ) -> tuple[Array, Array]:
     """Velocities and positions (6 M,) of the followers over the ground at the first epoch, and their covariance.
 
-    Raises InputError naming a follower that too few ranges place.
+    Raises InputError naming a follower that hears too few tags, or where too few anchors are heard.
     """
     M = len(names) - 1
     speed = SPEED_MPS[0] if rest_s is not None else SPEED_MPS[1]
@@ -93,7 +94,13 @@ def placed(
 
 
 def _enough(used: Sequence[tuple[RangeRow, float]], names: Sequence[str], until: float) -> None:
+    """Raises InputError for a follower with ranges to fewer than three other tags, or where hardly an anchor is heard."""
     for i in range(1, len(names)):
-        n = sum(i in (row.a, row.b) for row, _ in used)
-        if n < 3:
-            raise InputError(f"vehicle {names[i]}: {n} ranges until {until:.1f} s, too few to place it; at least 3 are needed")
+        n = len({row.label for row, _ in used if i in (row.a, row.b)})
+        if n < FEWEST:
+            raise InputError(
+                f"vehicle {names[i]}: ranges to {n} tags until {until:.1f} s, too few to place it; at least {FEWEST} are needed"
+            )
+    n = len({row.label for row, _ in used if 0 in (row.a, row.b)})
+    if n < FEWEST:
+        raise InputError(f"ranges to {n} anchors until {until:.1f} s, too few to place anything; at least {FEWEST} are needed")
