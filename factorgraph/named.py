@@ -10,7 +10,6 @@ from typing import Any
 
 from factorgraph.errors import InputError
 
-
 MOST_SHOWN, FIRST_SHOWN = 12, 8  # names in an error
 
 
