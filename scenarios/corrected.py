@@ -10,15 +10,17 @@ follow. Rows are as the filter linearised them. Of a filter that takes its rows 
 and a search can at best return to it; one that weighs rows or noise (huber, rackf, sage-husa, iae, rae, forgetting) is taken back
 to the noise as stated. Where a covariance is not sound, the posterior stays.
 
-Updates of the relative filter are judged and corrected as they are, distances and all.
+Updates of the relative filter are judged and corrected as they are, with distances and the constants of ranges.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 
 import numpy as np
 
+from factorgraph.errors import InputError
 from factorgraph.filters.correctors import Case, Searched
 from factorgraph.filters.methods import FILTERS
 from factorgraph.filters.recursive import Recursive
@@ -70,8 +72,8 @@ def _snapshot(case: Case, rows: BoolArray, dof: float | None) -> Snapshot:
 class RelativeCorrection:
     """Judges and corrects the updates of a relative filter, all draws from one generator.
 
-    A reference that stands on the ground has states without variance: they are left as they are. Scales and biases of ranges
-    are those predicted.
+    A reference that stands on the ground has states without variance: they are left as they are. Constants of ranges are states
+    like others.
     """
 
     corrector: Corrector
@@ -88,21 +90,37 @@ class RelativeCorrection:
 
 
 def relative_snapshot(update: Update, free: IntArray | None = None) -> Snapshot:
-    """An update of the relative filter, of the states `free` where only some have variance."""
-    free = np.arange(len(update.x_prior)) if free is None else free
-    rows, x, square = update.rows, update.x_prior, np.ix_(free, free)
-    z = rows.z.copy()
-    z[rows.norm_rows] -= rows.H[rows.norm_rows] @ x
+    """An update of the relative filter, of the states `free` where only some have variance; the others are as predicted.
+
+    Biases b of distances are exact. Errors k of their scale are of first order: with those predicted, x_0 and k_0,
+
+        (scale + k) |D x + d| + b = (scale + k_0) |D x + d| + (k - k_0) |D x_0 + d| + b
+
+    but for (k - k_0) times the change of the distance.
+    """
+    n, rows, x = len(update.x_prior), update.rows, update.x_prior
+    free = np.arange(n) if free is None else free
+    fixed, square = np.setdiff1d(np.arange(n), free), np.ix_(free, free)
+    H, z, D = rows.H.copy(), rows.z.copy(), rows.norm_D if len(rows.norm_rows) else np.zeros((0, 3, n))
+    scaled = np.flatnonzero(rows.norm_state >= 0)
+    row, k = rows.norm_rows[scaled], rows.norm_state[scaled]
+    size = np.linalg.norm(D @ x + rows.norm_d, axis=1)[scaled]
+    H[row, k] += size
+    z[row] += size * x[k]
     return Snapshot(
-        x[free], update.P_prior[square], update.x_post[free], update.P_post[square], z, rows.R, update.H[:, free],
-        rows.norm_rows, rows.norm_D[:, :, free] if len(rows.norm_rows) else rows.norm_D, rows.norm_d, rows.scales(x),
+        x[free], update.P_prior[square], update.x_post[free], update.P_post[square], z - H[:, fixed] @ x[fixed], rows.R,
+        update.H[:, free], rows.norm_rows, D[:, :, free], rows.norm_d + D[:, :, fixed] @ x[fixed], rows.scales(x),
+        H[rows.norm_rows][:, free],
     )  # fmt: skip
 
 
 def create(name: str, settings: CorrectorSettings = SETTINGS, integers: bool | None = None) -> Recursive | RelativeFilter:
-    """A method of the family FILTER-SEARCH; `integers` as in `Recursive`. Raises KeyError for an unknown filter."""
+    """A method of the family FILTER-SEARCH; `integers` as in `Recursive`.
+
+    Raises KeyError for an unknown filter, InputError where the search needs a package that is not installed.
+    """
     if name.startswith(f"{RELATIVE}-"):
-        search = name.removeprefix(f"{RELATIVE}-")
+        search = _at_hand(name.removeprefix(f"{RELATIVE}-"))
         return replace(
             relative.RELATIVE,
             name=name,
@@ -110,10 +128,17 @@ def create(name: str, settings: CorrectorSettings = SETTINGS, integers: bool | N
             correct=lambda: RelativeCorrection(Corrector(settings, search), np.random.default_rng(SEED)),
         )
     alone = name.removesuffix(SMOOTHED)
-    plain, search = next((f, alone[len(f) + 1 :]) for f in sorted(FILTERS, key=len, reverse=True) if alone.startswith(f"{f}-"))
-    method = FILTERS[plain]
+    plain = next((f for f in sorted(FILTERS, key=len, reverse=True) if alone.startswith(f"{f}-")), alone)
+    method, search = FILTERS[plain], _at_hand(alone[len(plain) + 1 :])
     corrected = replace(method, corrector=lambda: Searched(method.corrector(), Correction(search, settings)))
     return Recursive(name, f"{RECURSIVE[plain]}, corrected by {search}", corrected, name.endswith(SMOOTHED), integers)
+
+
+def _at_hand(search: str) -> str:
+    """The search, where what it needs is installed."""
+    if search == "cma-es" and find_spec("cmaes") is None:
+        raise InputError('the search cma-es needs cmaes, which is not installed; try: pip install "relnav[optimisers]"')
+    return search
 
 
 def __getattr__(name: str) -> Recursive | RelativeFilter:

@@ -120,8 +120,7 @@ def objective(which: Which, snapshot: Snapshot, coordinates: Space) -> Objective
     Raises LinAlgError where R (O2, O3) or P_prior (O3) is not positive definite.
     """
     T, x, q = coordinates.T, coordinates.x_0, len(snapshot.norm_rows)
-    H = snapshot.H.copy()
-    H[snapshot.norm_rows] = 0.0
+    H = snapshot.linear
     B = np.zeros((snapshot.m, q))
     B[snapshot.norm_rows, np.arange(q)] = snapshot.norm_scale
     D = np.einsum("qin,np->qip", snapshot.norm_D, T) if q else np.zeros((0, 3, T.shape[1]))

@@ -13,6 +13,9 @@ from factorgraph.errors import InputError
 from factorgraph.filters import methods as filters
 from factorgraph.filters.correctors import Case, Corrector, Iterated, Searched
 from factorgraph.filters.recursive import Recursive
+from factorgraph.filters.relative.filtering import Options, Update, run
+from factorgraph.filters.relative.motion import Smooth
+from factorgraph.filters.relative.rows import Distances, RangeRow, Rows, Source, stacked
 from factorgraph.filters.sequential import StageRows
 from factorgraph.problem import NavigationProblem
 from factorgraph.solution import Solution
@@ -21,6 +24,7 @@ from scenarios import corrected, methods
 from scenarios.cli import main
 from scenarios.simulate import load_scenario, simulate
 from scenarios.studies import replace_duration
+from swarm.corrector import Corrector as SwarmCorrector
 from swarm.judgement import Rule
 from tests.factorgraph.test_filters_recursive import quiet
 
@@ -142,7 +146,73 @@ def test_what_is_not_sound_is_not_searched() -> None:
     assert correct.triggered == 2
 
 
+# -- the relative filter ------------------------------------------------------------------------------
+
+ALWAYS = replace(corrected.SETTINGS, rule=Rule("always"))
+
+
+def ranged(*, bias: int, scale: int, far_m: float) -> list[Source]:
+    """One range to a follower, 3 m longer than it is thought to be."""
+    row = RangeRow(0, 1, np.array([0.0, 0.6, 0.8]), 0.0, 0.1, "a-b", scale=scale, bias=bias)
+    row = replace(row, range_m=3.0 + float(np.linalg.norm(row.arm_e + [far_m, 0.0, 0.0])))
+    return [Distances({0: [row]}, 6 + max(bias, scale) + 1, first_constant=6)]
+
+
+@pytest.mark.parametrize(("bias", "scale"), [(-1, -1), (0, -1), (-1, 0), (1, 0)])
+def test_gauss_newton_returns_to_the_posterior_with_constants_of_ranges(bias: int, scale: int) -> None:
+    """From far away distances are straight; a range that is too long is shared out between place, bias and scale."""
+    far_m = 1e5
+    sigma = {bias: 1.0, scale: 1.0 / far_m}
+    options = Options(constants=tuple(sigma[i] for i in range(max(bias, scale) + 1)))
+    sources, start = ranged(bias=bias, scale=scale, far_m=far_m), (np.array([0.0, 0, 0, far_m, 0, 0]), np.eye(6))
+    t_s = np.zeros(1)
+    correction = corrected.RelativeCorrection(SwarmCorrector(ALWAYS, "gauss-newton"), np.random.default_rng(0))
+    own, found = (
+        run(Smooth("velocity", 1, t_s, 0.3), sources, t_s, start, replace(options, correct=correct))
+        for correct in (None, correction)
+    )
+    assert found.triggered.all()
+    shares = 1 + (bias >= 0) + (scale >= 0)
+    assert own.x[0, 3] - far_m == pytest.approx(3.0 / (shares + 0.1**2))
+    s = np.sqrt(np.diag(own.P[0]))
+    np.testing.assert_allclose(found.x[0] / s, own.x[0] / s, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(found.P[0] / np.outer(s, s), own.P[0] / np.outer(s, s), atol=1e-3)
+
+
+def test_snapshots_of_relative_updates_are_their_rows() -> None:
+    """Innovations and rows are the filter's own, also where states that are not zero have no variance."""
+    rng = np.random.default_rng(5)
+    arms = rng.normal(size=(2, 3))
+    told = [RangeRow(0, 1, arms[0], 40.0, 0.1, "a-b", 0, 1), RangeRow(1, 2, arms[1], 70.0, 0.1, "b-c", bias=2)]
+    x, d = np.r_[rng.normal(0.0, 30.0, 12), 1e-3, 0.4, -0.7], 1e-3 * rng.normal(size=15)
+    linear = Rows(np.ones(4), rng.normal(size=(4, 15)), np.eye(4), np.zeros(4, np.int64), ("row",) * 4)
+    distances = Distances({0: told}, 15, scale=1.01, first_constant=12).rows(0, x)
+    assert distances is not None
+    rows = stacked([linear, distances])
+    e, H = rows.linearised(x)
+    P = np.eye(15)
+    update = Update(x, P, x, P, rows, H)
+    for fixed in ([], [0, 4, 13], [3, 12, 14]):
+        free = np.setdiff1d(np.arange(15), fixed)
+        s = corrected.relative_snapshot(update, free)
+        np.testing.assert_allclose(s.innovation, e, atol=1e-9)
+        np.testing.assert_allclose(s.jacobian(x[free]), H[:, free], atol=1e-12)
+        there = x.copy()
+        there[free] += d[free]
+        np.testing.assert_allclose(s.z - s.h(there[free][None])[0], rows.linearised(there)[0], atol=1e-5)
+
+
 # -- by name ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["relative-cma-es", "eskf-cma-es", "eskf-cma-es-rts"])
+def test_a_search_without_its_package_is_told_first(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    assert corrected.create(name).name == name
+    monkeypatch.setattr(corrected, "find_spec", lambda package: None)
+    with pytest.raises(InputError, match=r'the search cma-es needs cmaes, .* pip install "relnav\[optimisers\]"'):
+        methods.create(name)
+    other = name.replace("cma-es", "de")
+    assert corrected.create(other).name == other
 
 
 def test_filters_and_searches_make_names(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from swarm.snapshot import Snapshot
-from tests.swarm.snapshots import POS, PRIOR, RANGE, drawn
+from tests.swarm.snapshots import POS, PRIOR, RANGE, N, drawn
+
+BIASED = np.eye(1, N, 9) - 2.0 * np.eye(1, N, 11)
 
 
 def test_rows_predict_products_and_distances() -> None:
@@ -23,7 +25,7 @@ def test_rows_predict_products_and_distances() -> None:
 
 def test_jacobian_is_the_difference_of_predictions() -> None:
     s, _ = drawn(2)
-    s = replace(s, norm_d=np.array([[3.0, -5.0, 40.0]]), norm_scale=np.array([1.001]))
+    s = replace(s, norm_d=np.array([[3.0, -5.0, 40.0]]), norm_scale=np.array([1.001]), norm_G=BIASED)
     step = 1e-3 * np.eye(s.n)
     numeric = (s.h(PRIOR + step) - s.h(PRIOR - step)).T / 2e-3
     np.testing.assert_allclose(s.jacobian(PRIOR), numeric, atol=1e-7)
@@ -31,9 +33,21 @@ def test_jacobian_is_the_difference_of_predictions() -> None:
     np.testing.assert_allclose(s.S, s.H @ s.P_prior @ s.H.T + s.R)
 
 
+def test_distances_may_hold_products_besides() -> None:
+    s, _ = drawn(2)
+    biased = replace(s, norm_G=BIASED)
+    X = PRIOR + np.random.default_rng(0).normal(size=(4, s.n))
+    more = biased.h(X) - s.h(X)
+    np.testing.assert_allclose(more[:, RANGE], X[:, 9] - 2.0 * X[:, 11])
+    assert not np.delete(more, RANGE, 1).any()
+    np.testing.assert_array_equal(biased.linear[RANGE], BIASED[0])
+    assert not s.linear[RANGE].any() and s.H[RANGE].any()
+
+
 def test_states_that_rows_see() -> None:
     s, _ = drawn(3)
     assert s.seen.tolist() == [0, 1, 2, 3, 4, 5]
+    assert replace(s, norm_G=BIASED).seen.tolist() == [0, 1, 2, 3, 4, 5, 9, 11]
     D = s.norm_D.copy()
     D[0, 1, 9] = 0.5
     assert 9 in replace(s, norm_D=D).seen
@@ -52,6 +66,7 @@ def test_a_distance_of_zero_has_no_direction() -> None:
         ({"R": np.eye(20)}, r"R must have shape \(21, 21\)"),
         ({"H": np.zeros((12, 21))}, r"H must have shape \(21, 12\)"),
         ({"norm_D": np.zeros((1, 2, 12))}, r"norm_D must have shape \(1, 3, 12\)"),
+        ({"norm_G": np.zeros((2, 12))}, r"norm_G must have shape \(1, 12\), got \(2, 12\)"),
         ({"norm_scale": np.ones(2)}, r"norm_scale must have shape \(1,\)"),
         ({"norm_rows": np.array([21])}, r"norm_rows must be different rows below 21, got \[21\]"),
     ],
