@@ -32,7 +32,7 @@ Birge (1932) for scaled.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, Literal, get_args
@@ -254,26 +254,3 @@ def _decided(decided: Decided, snapshot: Snapshot) -> IntArray:
     if not (len(chosen) and chosen[0] >= 0 and chosen[-1] < snapshot.n):
         raise ValueError(f"decided must name states below {snapshot.n}, got {decided}")
     return chosen
-
-
-def relative_costs(
-    snapshots: Sequence[Snapshot],
-    searches: Mapping[str, Search],
-    seeds: Sequence[int],
-    settings: CorrectorSettings | None = None,
-) -> dict[str, Array]:
-    """(J - J_gn) / J_gn of each search's final cost J (snapshots, seeds) over that of Gauss-Newton on the same objective.
-
-    Every snapshot is searched, whatever the rule. Seeds are shared: with the same seed all searches of a snapshot draw from
-    generators of the same state.
-    """
-    wanted = settings or CorrectorSettings()
-    found = {name: np.empty((len(snapshots), len(seeds))) for name in searches}
-    for i, snapshot in enumerate(snapshots):
-        within, cost = posed(wanted, snapshot)
-        least = gauss_newton.minimize(cost, within.bounds, within.start).cost
-        for name, search in searches.items():
-            for j, seed in enumerate(seeds):
-                J = search(cost, within, np.random.default_rng([seed, i])).cost
-                found[name][i, j] = (J - least) / least
-    return found

@@ -32,10 +32,12 @@ from factorgraph.types import Array
 from scenarios.corrected import RelativeCorrection, relative_snapshot
 from scenarios.published import ahrs_tdo
 from scenarios.simulate.streams import Streams
+from swarm import gauss_newton
 from swarm.corrector import GAUSS_NEWTON, Corrector, CorrectorSettings, Optimiser, posed
 from swarm.judgement import Rule, trigger_rates
 from swarm.objective import Which
 from swarm.result import SwarmResult
+from swarm.snapshot import Snapshot
 
 Scene = Literal["published", "0.1mg", "outliers", "own-attitude", "own-code", "own-code-0.1mg"]
 TUNING_SEEDS = (1001, 1002, 1003, 1004, 1005)
@@ -172,15 +174,16 @@ def corrector(one: Filter, rng: np.random.Generator) -> Correct | None:
     return RelativeCorrection(Corrector(one.correction.settings, Optimiser(one.correction.method, EVALUATIONS, MEMBERS)), rng)
 
 
-def searched(update: Update, which: Which, methods: Sequence[str], seed: int) -> tuple[float, dict[str, SwarmResult]]:
+def searched(
+    snapshot: Snapshot, settings: CorrectorSettings, methods: Sequence[str], seed: int, evaluations: int = EVALUATIONS
+) -> tuple[float, dict[str, SwarmResult]]:
     """Gauss-Newton's minimum of an objective, and what every method makes of it."""
-    within, cost = posed(CorrectorSettings(objective=which), relative_snapshot(update))
-    least = Optimiser(GAUSS_NEWTON)(cost, within, np.random.default_rng(seed)).cost
+    within, cost = posed(settings, snapshot)
     runs = {
-        m: Optimiser(m, EVALUATIONS, MEMBERS)(cost, within, np.random.default_rng([seed, zlib.crc32(m.encode())]))
+        m: Optimiser(m, evaluations, MEMBERS)(cost, within, np.random.default_rng([seed, zlib.crc32(m.encode())]))
         for m in methods
     }
-    return least, runs
+    return gauss_newton.minimize(cost, within.bounds, within.start).cost, runs
 
 
 def rates(update: Update, rng: np.random.Generator) -> Mapping[str, Mapping[str, float]]:

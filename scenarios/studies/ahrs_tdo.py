@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -32,11 +32,14 @@ from factorgraph.filters.relative.flight import Configuration, Formation, truth_
 from factorgraph.problem import NavigationProblem
 from factorgraph.sampling import interpolate
 from factorgraph.types import Array
+from scenarios.corrected import relative_snapshot
 from scenarios.published import ahrs_tdo, ahrs_tdo_filters
 from scenarios.published.ahrs_tdo import FOLLOWER, LEADER
 from scenarios.published.ahrs_tdo_filters import EVALUATIONS, FILTERS, TUNING_SEEDS
 from scenarios.studies.optimisers import on_grid
 from scenarios.studies.study import Arrays, Job, Outcome, Results, chosen, seeds
+from swarm.corrector import CorrectorSettings
+from swarm.objective import Which
 
 REVISION = 1  # of what a job computes; results of another one are not used again
 PHASES = "graph-phases"  # the graph with carrier phases, which the published system lacks
@@ -46,6 +49,7 @@ OTHERS = {
     "eskf": "error-state Kalman filter",
     PHASES: "factor graph with carrier phases",
 }
+FLIGHT_S = 600.0
 BOUND, SEARCHES, RULES, TUNING = "bound", "searches", "rules", "walks"
 SEARCH_METHODS = ("tdo", "pso", "ga")
 SEARCHED_S = (100.0, 252.0, 350.0, 452.0)  # two quiet updates, two while the follower is pushed aside
@@ -69,7 +73,9 @@ class AhrsTdoStudy:
             "--configurations", metavar="NAME", nargs="+", default=None,
             help=f"only these, without searches, rules and tuning: {', '.join(known)} (all; a part if quick)",
         )  # fmt: skip
-        parser.add_argument("--seconds", type=float, default=600.0, help="of the flight that the relative filters see (600)")
+        parser.add_argument(
+            "--seconds", type=float, default=FLIGHT_S, help=f"of the flight that the relative filters see ({FLIGHT_S:g})"
+        )
 
     def jobs(self, options: argparse.Namespace) -> Sequence[Job]:
         if not options.seconds >= 10.0:
@@ -108,7 +114,7 @@ def command_line(options: argparse.Namespace) -> str:
     words = ["relnav study ahrs-tdo", *(["--quick"] if options.quick else [])]
     words += [f"--trials {options.trials}"] if options.trials is not None else []
     words += [f"--configurations {' '.join(options.configurations)}"] if options.configurations else []
-    words += [f"--seconds {options.seconds:g}"] if options.seconds != 600.0 else []
+    words += [f"--seconds {options.seconds:g}"] if options.seconds != FLIGHT_S else []
     return " ".join([*words, *([f"--seed {options.seed}"] if options.seed != 1 else [])])
 
 
@@ -119,7 +125,7 @@ def _flights(asked: Sequence[str], trials: Sequence[int], seconds: float) -> Ite
         for scene in dict.fromkeys(scenes.values()):
             filters = [name for name in scenes if scenes[name] == scene]
             settings = {name: ahrs_tdo_filters.told(FILTERS[name]) for name in filters}
-            whole = filters == [name for name, f in FILTERS.items() if f.scene == scene] and seconds == 600.0
+            whole = filters == [name for name, f in FILTERS.items() if f.scene == scene] and seconds == FLIGHT_S
             tag = "" if whole else f"-{zlib.crc32(f'{filters}{seconds}'.encode()):08x}"  # a part is filed apart from the whole
             told = {"part": scene, "filters": filters, "settings": settings, "seconds": seconds, "seed": seed}
             yield Job(f"{scene}-{seed:04d}{tag}", told | {"revision": REVISION})
@@ -270,8 +276,9 @@ def searches(seed: int, seconds: float) -> dict[str, Any]:
     updates = recorded(seed, SEARCHED_S, seconds)
     out: dict[str, list[Any]] = {}
     for i, update in enumerate(updates):
-        for which in ("O1", "O2", "O3"):
-            best, runs = ahrs_tdo_filters.searched(update, which, SEARCH_METHODS, seed * 1000 + i)
+        for which in get_args(Which):
+            settings = CorrectorSettings(objective=which)
+            best, runs = ahrs_tdo_filters.searched(relative_snapshot(update), settings, SEARCH_METHODS, seed * 1000 + i)
             for method, run in runs.items():
                 history = on_grid(run.history_evals, run.history, GRID)
                 out.setdefault(f"{which}/{method}/excess", []).append(run.cost / best - 1.0)

@@ -113,7 +113,16 @@ def rmse_table(summary: Summary, letter: str) -> Table:
         f"published X / Y / Z ({source})",
         "seeds",
     )
-    return Table(f"{what}, RMSE", head, tuple(rows), MARKED)
+    return Table(f"{what}, RMSE", head, tuple(rows), f"{MARKED}{_shorter(summary)}")
+
+
+def _shorter(summary: Summary) -> str:
+    """Who saw less of the flight than others."""
+    names = summary.cut_short
+    if not names:
+        return ""
+    until = max(summary.rows[name].end_s for name in names)
+    return f" Until {plain(until)} s of the flight: {', '.join(title_of(name) for name in names)}."
 
 
 def marked(row: Row) -> str:
@@ -280,7 +289,7 @@ def write(results: Results[Job], folder: Path, command: str) -> Outcome:
 
 
 def _aim_lines(judged: Sequence[Claim]) -> list[str]:
-    return [f"{c.text}: {c.word} ({c.ours}). {c.evidence}" for c in judged if c.id.startswith("aim-r")]
+    return [f"{c.text}: {c.word} ({c.ours}). {c.evidence}" for c in judged if c.id.startswith(("aim-r", "bound-r"))]
 
 
 def markdown(summary: Summary, judged: Sequence[Claim], command: str) -> str:

@@ -5,6 +5,7 @@
     manoeuvre  epochs from the start of a push to RECOVERED_S after its end, "quiet" all others
     NEES       of relative position and velocity (6); a filter is consistent where the mean over the seeds lies in its 99 %
                band at 90 % of the epochs
+    bound      root of the mean square over seeds and epochs over that of the bound
     NIS        mean per row, with the 95 % band that white innovations would have
 
 Intervals of means are Student's, of paired differences bootstrapped over the seeds; both filters of a pair saw the same noise.
@@ -12,10 +13,10 @@ Intervals of means are Student's, of paired differences bootstrapped over the se
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -37,14 +38,17 @@ from scenarios.studies.statistics import (
     mean_of_known,
 )
 from scenarios.studies.study import Arrays, Job, Results
+from swarm.objective import Which
 
 SETTLED_S = 60.0  # the first straight leg is not counted
 RECOVERED_S = 7.0
+SAME_END_S = 5.0  # flights that end this near to each other are equally long
 AXES = "xyz"
 PUBLISHED = "ahrs-tdo-o1"  # our reading of the published system
 PLAIN = "ahrs"
 EVEN = 1e-6  # relative differences of a searched minimum that do not matter
-OBJECTIVES = ("O1", "O2", "O3")
+OBJECTIVES: tuple[Which, ...] = get_args(Which)
+BOUND_SET = tuple(name for name in OTHERS if name != PHASES)  # estimators of what the bound is of
 
 METRICS = {
     **{f"r_{axis}": Metric(f"position {axis.upper()}, RMSE", "m", -1) for axis in AXES},
@@ -101,6 +105,11 @@ class Row:
     @property
     def is_consistent(self) -> bool:
         return self.nees_consistent >= CONSISTENT_PCT
+
+    @property
+    def end_s(self) -> float:
+        """Until when it saw the flight."""
+        return float(self.t_s[-1])
 
 
 Difference = PairedDifference[str]
@@ -203,8 +212,28 @@ class Summary:
     @property
     def best(self) -> Row | None:
         """The estimator without carrier phases that has the smallest position error on the flight as published."""
-        found = [row for row in self.published_scene if row.name != PHASES and np.isfinite(np.mean(row.values["r_3d"]))]
-        return min(found, key=lambda row: float(np.mean(row.values["r_3d"])), default=None)
+        return self.best_of([row.name for row in self.published_scene if row.name != PHASES])
+
+    def best_of(self, names: Collection[str]) -> Row | None:
+        """That of the smallest position error, of those that saw as much of the flight as any estimator."""
+        left_out = self.cut_short
+        found = [row for name, row in self.rows.items() if name in names and name not in left_out]
+        known = [row for row in found if np.isfinite(np.mean(row.values["r_3d"]))]
+        return min(known, key=lambda row: float(np.mean(row.values["r_3d"])), default=None)
+
+    @property
+    def cut_short(self) -> list[str]:
+        """Estimators that saw less of the flight than others."""
+        whole = max((row.end_s for row in self.rows.values()), default=0.0)
+        return [name for name, row in self.rows.items() if row.end_s < whole - SAME_END_S]
+
+    def over_bound(self, name: str) -> list[Statistic | None]:
+        """Errors of an estimator over the bound, in the order of `bound`; of none where either is missing."""
+        if self.bound is None or name not in self.rows:
+            return []
+        values = self.rows[name].values
+        errors = (values[f"{letter}_{axis}"] for letter in "rv" for axis in AXES)
+        return [_root(statistic((x / least) ** 2)) for x, least in zip(errors, self.bound, strict=True)]
 
     @property
     def n_seeds(self) -> int:
@@ -220,6 +249,14 @@ def statistic(x: Array) -> Statistic | None:
     found = mean_interval(x)
     lower, upper = (v if np.isfinite(v) else NAN for v in (found.lower, found.upper))
     return Statistic(found.value, lower, upper, float(x.min()), float(x.max()), len(x))
+
+
+def _root(found: Statistic | None) -> Statistic | None:
+    """Of a mean square."""
+    if found is None:
+        return None
+    value, lower, upper, low, high = (float(np.sqrt(max(v, 0.0))) for v in found.numbers)
+    return Statistic(value, lower, upper, low, high, found.n)
 
 
 # trials
@@ -321,7 +358,7 @@ def _rms(x: Array) -> float:
 
 
 def _searches(trials: Sequence[Arrays]) -> dict[str, Search]:
-    found = {}
+    found: dict[str, Search] = {}
     for which in OBJECTIVES if trials else ():
         methods = [m for m in SEARCH_METHODS if f"{which}/{m}/excess" in trials[0]]
         stacked = {

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -46,7 +46,7 @@ SEARCHES = {
     "pair-O2": 6,
     "pair-O3": 6,
     "formation-O3": 12,
-}  # number of states that rows see: all of them are searched
+}  # what is drawn (`optimisers_snapshots.DRAWS`) and the objective; number of states that rows see: all of them are searched
 BOX_SIGMAS = 3.0  # to either side of the posterior
 NAVIGATION: tuple[Literal["normalised", "whitened", "raw"], ...] = ("normalised", "whitened", "raw")  # coordinates
 
@@ -232,14 +232,15 @@ def _task(label: str, name: str, n: int, **place: Array) -> Task:
 
 
 def _navigation(name: str, n: int, rng: np.random.Generator) -> Iterator[tuple[str, Task]]:
-    from scenarios.studies.optimisers_snapshots import SEARCHES
+    from scenarios.studies.optimisers_snapshots import DRAWS
     from swarm import gauss_newton
     from swarm.corrector import CorrectorSettings, posed
+    from swarm.objective import Which
 
-    draw, which = SEARCHES[name]
-    snapshot = draw(rng)
+    drawn, _, which = name.partition("-")
+    snapshot = DRAWS[drawn](rng)
     for kind in NAVIGATION:
-        settings = CorrectorSettings(objective=which, others="kept", coordinates=kind, box_sigmas=BOX_SIGMAS)
+        settings = CorrectorSettings(objective=cast(Which, which), others="kept", coordinates=kind, box_sigmas=BOX_SIGMAS)
         within, cost = posed(settings, snapshot)
         best = gauss_newton.minimize(cost, within.bounds, within.start).cost
         yield kind, Task(f"{name}, n = {n}", cost.compiled(), within.bounds, SOLVED_RATIO, EVEN_RATIO, scale=best, offset=best)

@@ -21,7 +21,6 @@ from scipy.linalg import block_diag
 
 from factorgraph.filters import kalman
 from factorgraph.types import Array
-from swarm.objective import Which
 from swarm.snapshot import Snapshot
 
 CODE_M, RATE_MPS, RANGE_M = 3.0, 0.03, 0.15
@@ -68,12 +67,7 @@ def formation(rng: np.random.Generator) -> Snapshot:
     return _snapshot(x, np.full(12, FORMATION_SIGMA_M), H, R, D, rng)
 
 
-SEARCHES: dict[str, tuple[Callable[[np.random.Generator], Snapshot], Which]] = {
-    "pair-O1": (pair, "O1"),
-    "pair-O2": (pair, "O2"),
-    "pair-O3": (pair, "O3"),
-    "formation-O3": (formation, "O3"),
-}
+DRAWS: dict[str, Callable[[np.random.Generator], Snapshot]] = {"pair": pair, "formation": formation}
 
 
 def _double_differences(n: int, rng: np.random.Generator) -> Array:

@@ -4,22 +4,31 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from factorgraph import registry
+from factorgraph.problem import NavigationProblem
+from factorgraph.solution import Solution
 from factorgraph.types import Array
 from scenarios import cli
+from scenarios.published import ahrs_tdo as scene
 from scenarios.published import ahrs_tdo_filters
-from scenarios.published.ahrs_tdo_filters import CA_CV, FILTERS
+from scenarios.published.ahrs_tdo_filters import CA_CV, EVALUATIONS, FILTERS
+from scenarios.simulate.scenario import load_scenario
+from scenarios.simulate.trajectory import Manoeuvres, Segment
 from scenarios.studies import ahrs_tdo
 from scenarios.studies.ahrs_tdo import BOUND, GRID, OTHERS, RULES, SEARCHES, TUNING
-from scenarios.studies.ahrs_tdo_claims import PAPER_POSITION, PAPER_VELOCITY, claims
+from scenarios.studies.ahrs_tdo_claims import AIM, PAPER_POSITION, PAPER_VELOCITY, claims
 from scenarios.studies.ahrs_tdo_record import markdown, tables
 from scenarios.studies.ahrs_tdo_summary import (
+    BOUND_SET,
+    OBJECTIVES,
     PLAIN,
     PUBLISHED,
     SETTLED_S,
@@ -35,6 +44,7 @@ from scenarios.studies.verdicts import Claim, Verdict
 
 T = np.arange(601.0)
 SEEDS = (1, 2, 3, 4, 5, 6)
+LASTS = 24.0  # s, of flights that are simulated
 
 
 def flown(name: str, position: Array, velocity: Array, seed: int) -> dict[str, Any]:
@@ -51,7 +61,7 @@ def flown(name: str, position: Array, velocity: Array, seed: int) -> dict[str, A
         f"{name}/nees": np.sum(unit**2, axis=1),
         f"{name}/nis": rng.chisquare(21, len(T)),
         f"{name}/n_rows": np.full(len(T), 21),
-        f"{name}/triggered": (np.arange(len(T)) % 5 == 0) & (FILTERS[name].correction is not None),
+        f"{name}/triggered": (np.arange(len(T)) % 5 == 0) & (name in FILTERS and FILTERS[name].correction is not None),
         f"{name}/runtime_s": np.array(0.5),
     }
 
@@ -140,6 +150,64 @@ def test_optimistic_filters_are_marked() -> None:
     assert any("‡" in row[0] for table in tables(summary) for row in table.rows)
 
 
+def bounded(graph: float, spread: float = 0.01, least: float = 0.2) -> dict[Job, Mapping[str, Any]]:
+    """The graph at so many times the bound, and a filter with attitude systems below the bound."""
+    sigma = np.repeat([least, 0.1 * least], 3)
+    found = results(spread, graph=(graph * sigma[:3], graph * sigma[3:]), ahrs=(0.5 * sigma[:3], 0.5 * sigma[3:]))
+    return found | {Job("bound", {"part": BOUND}): {"t_s": T, "sigma": np.tile(sigma, (len(T), 1))}}
+
+
+@pytest.mark.parametrize(
+    ("graph", "spread", "verdict"),
+    [
+        (1.05, 0.01, Verdict.REPRODUCED),
+        (1.05, 0.1, Verdict.PARTLY),  # the mean is near enough, its interval is not
+        (1.15, 0.01, Verdict.NOT_REPRODUCED),
+    ],
+)
+def test_the_best_of_the_sensors_of_the_bound_is_held_against_it(graph: float, spread: float, verdict: Verdict) -> None:
+    summary, said = judged(bounded(graph, spread))
+    assert summary.best is not None and summary.best.name == PLAIN and set(BOUND_SET) == {"graph", "moving-horizon", "eskf"}
+    for id in ("bound-r", "bound-v"):
+        assert said[id].verdict is verdict and said[id].ours.startswith("factor graph, whole flight: X 1.")
+        assert "IMU, code, Doppler and ranges, without attitude systems" in said[id].text
+    ratios = summary.over_bound("graph")
+    squares = [s.value**2 for s in ratios if s is not None]
+    assert squares == pytest.approx([graph**2 * np.mean((1 + spread * (np.arange(6) - 2.5)) ** 2)] * 6)  # not the mean of roots
+    without, said = judged(results(0.01, graph=(np.ones(3), np.ones(3))))
+    assert without.over_bound("graph") == [] and said["bound-r"].verdict is Verdict.NOT_TESTED
+
+
+def test_an_aim_below_the_bound_is_said_to_be_out_of_reach() -> None:
+    _, said = judged(bounded(1.05))
+    assert "cannot be reached" in said["aim-r-x"].evidence and "0.2 m, 1.44 times the aim" in said["aim-r-x"].evidence
+    assert 0.2 / (AIM * PAPER_POSITION[PUBLISHED][0]) == pytest.approx(1.44, abs=0.005)
+    _, said = judged(bounded(1.05, least=0.01))
+    assert "It can be reached" in said["aim-r-x"].evidence and said["aim-r-x"].verdict is Verdict.REPRODUCED
+
+
+def test_flights_of_different_length_are_not_compared() -> None:
+    def part_of(name: str, end: int) -> dict[Job, Mapping[str, Any]]:
+        return {
+            Job(job.key.replace("published", name), job.parameters): {
+                key: np.asarray(x)[:end] if np.ndim(x) else x for key, x in arrays.items() if key.startswith((f"{name}/", "t_s"))
+            }
+            for job, arrays in bounded(1.05).items()
+            if job.parameters["part"] == "published"
+        }
+
+    short = part_of(PLAIN, 21)
+    summary, said = judged(short | part_of("graph", len(T)))
+    assert summary.cut_short == [PLAIN] and summary.best is not None and summary.best.name == "graph"
+    assert said["aim-r-x"].evidence.endswith("Until 600 s of the flight. Left out, since they saw less of it: AHRS.")
+    assert "Until 20 s of the flight: AHRS." in markdown(summary, list(said.values()), "relnav")
+    summary, said = judged(short)
+    assert summary.best is not None and summary.best.name == PLAIN
+    assert said["aim-r-x"].evidence.endswith("Until 20 s of the flight.")
+    _, said = judged(part_of(PLAIN, len(T)))
+    assert "Until" not in said["aim-r-x"].evidence
+
+
 def searched(tdo: float, pso: float) -> Search:
     rng = np.random.default_rng(0)
     excess = {m: x * rng.uniform(0.8, 1.2, (20, 4)) for m, x in (("tdo", tdo), ("pso", pso))}
@@ -225,6 +293,100 @@ def test_the_other_estimators_turn_to_earth_fixed_axes() -> None:
     assert C @ [1.0, 0.0, 0.0] @ [0.0, 0.0, 1.0] == pytest.approx(0.0, abs=1e-12)  # east has no component along the axis
 
 
+@pytest.fixture
+def turning(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The published pair for LASTS seconds of turns, which show the attitudes."""
+    base = load_scenario(scene.NAME)
+    leader, follower = base.vehicle
+    assert isinstance(leader.trajectory, Manoeuvres)
+    turns = (Segment(duration_s=2.0), Segment(duration_s=10.0, turn_dps=9.0), Segment(duration_s=LASTS, turn_dps=-9.0))
+    leader = leader.model_copy(update={"trajectory": leader.trajectory.model_copy(update={"segments": turns})})
+    info = base.scenario.model_copy(update={"duration_s": LASTS})
+    short = base.model_copy(update={"vehicle": (leader, follower), "scenario": info})
+    monkeypatch.setattr(scene, "load_scenario", lambda name: short)
+    for name, value in (("SEARCHED_S", (10.0, 15.0)), ("JUDGED_S", (10.0, 12.0, 15.0)), ("WALKED", (0.02, 0.2, 5.0))):
+        monkeypatch.setattr(ahrs_tdo, name, value)
+    monkeypatch.setattr(ahrs_tdo_filters, "RULE_TRIALS", 1000)
+    kept = (scene._exact, ahrs_tdo.prepared)
+    for known in kept:
+        known.cache_clear()
+    yield
+    for known in kept:
+        known.cache_clear()
+
+
+def part(name: str) -> dict[str, Array]:
+    found = ahrs_tdo.STUDY.run(Job(name, {"part": name, "seed": 1, "seconds": 16.0}))
+    return {key: np.asarray(x) for key, x in found.items()}
+
+
+def test_searches_of_recorded_updates(turning: None) -> None:
+    found = part(SEARCHES)
+    names = [f"{which}/{m}" for which in OBJECTIVES for m in ahrs_tdo.SEARCH_METHODS]
+    assert set(found) == {f"{name}/{what}" for name in names for what in ("excess", "evals", "history")}
+    for name in names:
+        excess, evals, history = (found[f"{name}/{what}"] for what in ("excess", "evals", "history"))
+        assert excess.shape == evals.shape == (2,) and history.shape == (2, len(GRID))
+        assert np.all(excess > -1e-3) and np.all(excess < 0.05), name
+        assert np.all((evals > 0) & (evals <= EVALUATIONS))  # some methods end where nothing changes any more
+        assert np.all(np.diff(history, axis=1) <= 0) and np.all(history[:, 0] > excess)
+        np.testing.assert_allclose(history[:, -1], excess)
+
+
+def test_rules_at_recorded_updates(turning: None) -> None:
+    found = part(RULES)
+    assert len(found) == 4 * 4 and all(x.shape == (3,) and np.all((x >= 0) & (x <= 1)) for x in found.values())
+    rules = {name.partition("/")[0] for name in found}
+    assert rules == {"literal", "literal, residual", "normalised", "nis"}
+    assert all(np.mean(found[f"{rule}/none"]) < np.mean(found[f"{rule}/UWB 3 m"]) for rule in rules)
+
+
+def test_walks_are_tried_on_both_smooth_motions(turning: None) -> None:
+    found = part(TUNING)
+    assert set(found) == {"walk", *(f"{n}/{what}" for n in ("cv", "ca") for what in ("position_m", "velocity_mps"))}
+    assert all(x.shape == (3,) and np.all(x > 0) for x in found.values())
+    stiff, _, loose = found["cv/velocity_mps"]
+    assert stiff > 1.5 * loose  # in turns constant velocity is wrong
+
+
+def test_other_estimators_and_the_bound(turning: None) -> None:
+    bound = part(BOUND)
+    k = len(bound["t_s"])
+    assert set(bound) == {"t_s", "sigma"} and bound["sigma"].shape == (k, 6) and k == LASTS + 1
+    for name in OTHERS:
+        found = part(name)
+        shapes = {"position_error_m": (k, 3), "velocity_error_mps": (k, 3), "sigma": (k, 6), "nees": (k,), "runtime_s": ()}
+        assert {key: x.shape for key, x in found.items()} == {"t_s": (k,), **{f"{name}/{w}": s for w, s in shapes.items()}}
+        assert np.all(found[f"{name}/nees"] >= 0) and found[f"{name}/runtime_s"] > 0
+        ratio = found[f"{name}/sigma"] / bound["sigma"]
+        if name in BOUND_SET:
+            assert np.all(ratio[-1] > 0.97), name  # linearised where it was estimated
+            size = np.linalg.norm(found[f"{name}/position_error_m"][-1])
+            assert size < 4 * np.linalg.norm(found[f"{name}/sigma"][-1, :3])
+        else:
+            assert np.all(ratio[:, :3] < 0.1)  # what phases add
+
+
+def test_errors_of_other_estimators_are_estimates_less_truth(turning: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    solution, up_m = registry.solve(ahrs_tdo.raw(1), "eskf"), 10.0
+
+    def shifted_up(by: float) -> Array:
+        pair = replace(solution.pairs[0], baseline_enu=solution.pairs[0].baseline_enu + [0.0, 0.0, by])
+
+        def solved(problem: NavigationProblem, method: str) -> Solution:
+            return replace(solution, pairs=(pair,))
+
+        monkeypatch.setattr(registry, "solve", solved)
+        return np.asarray(ahrs_tdo.solve("eskf", 1)["eskf/position_error_m"])
+
+    moved = shifted_up(up_m) - shifted_up(0.0)
+    problem = ahrs_tdo.raw(1)
+    leader = problem.vehicle(scene.LEADER).truth
+    assert leader is not None
+    up = problem.frame.to_ecef(leader.r_n[0])
+    np.testing.assert_allclose(moved @ (up / np.linalg.norm(up)), up_m, rtol=1e-3)
+
+
 def test_a_short_flight_from_jobs_to_page(tmp_path: Path) -> None:
     asked = options(trials=1, seconds=20.0, configurations=["ca", "ahrs", "ahrs-tdo-o2", "ahrs-gauss-newton"])
     found = {job: ahrs_tdo.STUDY.run(job) for job in ahrs_tdo.STUDY.jobs(asked)}
@@ -237,8 +399,9 @@ def test_a_short_flight_from_jobs_to_page(tmp_path: Path) -> None:
     rows = {row["name"]: row["statistics"] for row in content["rows"]}
     assert set(rows) == {"ca", "ahrs", "ahrs-tdo-o2", "ahrs-gauss-newton"}
     assert 0 < rows["ahrs-tdo-o2"]["triggered"][0] < 60
-    # the same objective has one minimum: what finds it hardly matters
-    assert rows["ahrs-tdo-o2"]["r_3d"][0] == pytest.approx(rows["ahrs-gauss-newton"]["r_3d"][0], rel=0.02)
+    # the same objective has one minimum: what finds it hardly matters, where the prior is wide a little
+    assert rows["ahrs-tdo-o2"]["r_3d"][0] == pytest.approx(rows["ahrs-gauss-newton"]["r_3d"][0], rel=0.1)
+    assert rows["ahrs"]["r_3d"][0] < 0.75 * rows["ahrs-gauss-newton"]["r_3d"][0]
     assert "| CA: constant acceleration" in (tmp_path / "ahrs-tdo.md").read_text()
     assert (tmp_path / "report.html").stat().st_size > 1e6
 
