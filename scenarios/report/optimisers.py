@@ -246,7 +246,7 @@ def rank_chart(title: str, found: Ranking, methods: Sequence[str]) -> Chart:
     layout = {
         "hovermode": False,
         "dragmode": False,
-        "xaxis": HIDDEN_AXIS | {"range": [-0.2 * k, 1 + 1.2 * k]},
+        "xaxis": HIDDEN_AXIS | {"range": [-0.5 * k, 1 + 1.5 * k]},
         "yaxis": HIDDEN_AXIS | {"range": [lowest, 3.0]},
     }
     return Chart(title, data, layout, 60 + round(26 * (3.0 - lowest)), f"{found.n_blocks} problems ranked.", wide=False)
