@@ -54,19 +54,11 @@ def minimize(
     first_step: float = FIRST_STEP,
     last_step: float = LAST_STEP,
 ) -> SwarmResult:
-    """Minimise a cost inside a box.
+    """Minimise a cost inside a box. Arguments as in `swarm.minimize`, and:
 
     Parameters
     ----------
-    cost : takes points (k, n), k <= n_members, and returns their costs (k,), or a `CompiledCost`; what is not finite counts
-        as infinite
-    bounds : (n, 2) lower and upper limit of each coordinate
-    rng : source of all randomness
-    max_evals : points the cost may see in all; never exceeded
     n_iter : generations T, after which the search ends; where None, what the evaluations allow
-    x0 : (n,) a first point inside the box, given to one member
-    target : stop once the best cost is this low
-    callback : hears of every generation; the search stops where it returns True
     crossover : probability that a child blends two parents
     alpha : how far beyond its parents a child may lie, in their distance
     mutation : probability for a gene; 1 / n where None

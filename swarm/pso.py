@@ -49,19 +49,11 @@ def minimize(
     c1: float = C1,
     c2: float = C2,
 ) -> SwarmResult:
-    """Minimise a cost inside a box.
+    """Minimise a cost inside a box. Arguments as in `swarm.minimize`, and:
 
     Parameters
     ----------
-    cost : takes points (k, n), k <= n_members, and returns their costs (k,), or a `CompiledCost`; what is not finite counts
-        as infinite
-    bounds : (n, 2) lower and upper limit of each coordinate
-    rng : source of all randomness
-    max_evals : points the cost may see in all; never exceeded
     n_iter : iterations after the first population; as many as the evaluations allow where None
-    x0 : (n,) a first point inside the box, given to one particle
-    target : stop once the best cost is this low
-    callback : hears of every population; the search stops where it returns True
     topology : "global" or "ring"
     xtol : stop once all particles and their best points lie within this part of the box in every coordinate
     w, c1, c2 : inertia, pull of the own best, pull of the neighbours' best

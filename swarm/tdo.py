@@ -55,19 +55,11 @@ def minimize(
     chase_all: bool = False,
     radius: float = RADIUS,
 ) -> SwarmResult:
-    """Minimise a cost inside a box.
+    """Minimise a cost inside a box. Arguments as in `swarm.minimize`, and:
 
     Parameters
     ----------
-    cost : takes points (k, n), k <= n_members, and returns their costs (k,), or a `CompiledCost`; what is not finite counts
-        as infinite
-    bounds : (n, 2) lower and upper limit of each coordinate
-    rng : source of all randomness
-    max_evals : points the cost may see in all; never exceeded
     n_iter : T, after which the search ends; where None, what the evaluations allow on average
-    x0 : (n,) a first point inside the box, given to one member
-    target : stop once the best cost is this low
-    callback : hears of every iteration; the search stops where it returns True
     chase_all : every member chases ("tdo-chase-all")
     radius : R at t = 0
 
