@@ -46,7 +46,8 @@ def imported(package: str) -> set[str]:
 
 
 def test_every_imported_package_is_declared_and_every_declared_one_is_imported() -> None:
-    declared = names(PROJECT["dependencies"]) | names(PROJECT["optional-dependencies"]["figures"])
+    optional = PROJECT["optional-dependencies"]
+    declared = names(PROJECT["dependencies"]) | names(optional["figures"]) | names(optional["optimisers"])
     used = set().union(*(imported(p) for p in PACKAGES)) - set(sys.stdlib_module_names) - set(PACKAGES)
     owners = packages_distributions()
     assert {canonical(owners[name][0]) for name in used} == declared

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorgraph import registry
 from factorgraph.attitude import matrix_from_euler
 from factorgraph.errors import InputError
 from factorgraph.geodesy import LocalFrame
@@ -23,7 +22,7 @@ from factorgraph.gpstime import GpsTime
 from factorgraph.measurements import ImuStream, PositionStream, RangeStream, Tag
 from factorgraph.problem import NavigationProblem, Vehicle
 from factorgraph.types import Array
-from scenarios import guard
+from scenarios import guard, methods
 from scenarios.flights import LoadedFlight, antennas, frozen, load
 from scenarios.flights.catalogue import locate, names
 from scenarios.flights.epochs import code_misfit_m, tag_error_s
@@ -230,7 +229,7 @@ def test_an_error_after_a_doubt_names_it(car: Path, relnav: Relnav, monkeypatch:
     def refuse(*_: object) -> None:
         raise InputError("no start")
 
-    monkeypatch.setattr(registry, "solve", refuse)
+    monkeypatch.setattr(methods, "solve", refuse)
     DOUBTFUL["frozen radio"][0](car)
     assert "no start; doubtful in the flight: uwb: the range" in one_error_line(relnav("smooth", car))
 

@@ -22,7 +22,7 @@ from scenarios.studies import aar
 from scenarios.studies.aar_summary import DEFAULT, GRAPH, SWEEP, JobKey, algorithms, measure, windows
 from scenarios.studies.study import Job
 
-SEEDS = (1, 2)
+SEEDS = (2,)  # the record has 50
 ASKED = {
     1: ("1b", "2b", "3a", "3b"),
     2: ("1b", "3a", "3b", "4a", "4b"),
