@@ -9,7 +9,6 @@ import pytest
 
 from factorgraph.filters.relative.filtering import Update
 from factorgraph.filters.relative.flight import Configuration, Formation, prepare, truth_of
-from factorgraph.filters.relative.motion import integrate
 from factorgraph.filters.relative.own import own_motions
 from factorgraph.filters.relative.rows import Places
 from factorgraph.geodesy import LocalFrame
@@ -165,7 +164,6 @@ def turned(flight: Formation, angle: float, R: Array) -> Formation:
         flight,
         problem=replace(flight.problem, frame=frame),
         movers=movers,
-        increments=tuple(integrate(m, flight.t_s) for m in movers),
         places=Places(*(x @ R.T for x in (p.reference_e, p.reference_v_e, p.arm_e, p.arm_v_e))),
         absolute=(r_e @ R.T, v_e @ R.T, both @ P @ both.T),
         ranges={k: [replace(row, arm_e=R @ row.arm_e) for row in rows] for k, rows in flight.ranges.items()},

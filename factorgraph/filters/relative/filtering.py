@@ -5,8 +5,8 @@
 
 The corrector is any callable; the judgement rule and the swarm optimisers of Lu et al. (2024) are one. A strong tracking factor
 on what the transition brings is the control that needs neither. Where ranges alone place vehicles a few metres apart, distances
-bend within the prior's covariance: an iterated update linearises them again where it leads, a cubature update sees them through
-points. Losses weigh ranges and heights by their standardised innovations; double differences are correlated and are not weighed.
+bend within the prior's covariance: an iterated update linearises them again where it leads. Losses weigh ranges and heights by
+their standardised innovations; double differences are correlated and are not weighed.
 
 Source: Lu et al. (2024), section 3.5; spec ahrs_tdo.md, sections 2.7 and 2.8.
 """
@@ -24,12 +24,11 @@ from factorgraph.filters import kalman, updates
 from factorgraph.filters.adaptive import Fading
 from factorgraph.filters.relative.motion import Motion, position, velocity
 from factorgraph.filters.relative.rows import KINDS, Rows, Source, stacked
-from factorgraph.filters.sigma_points import cubature
 from factorgraph.models.robust import Loss
 from factorgraph.models.robust import weight as robust_weight
 from factorgraph.types import Array, BoolArray, IntArray
 
-Form = Literal["linear", "iterated", "cubature"]
+Form = Literal["linear", "iterated"]
 WEIGHED = ("range", "height")  # kinds whose rows are independent
 LEAST = 1e-6  # weight
 SHOWS = 0.1  # of the noise: second order that an update is iterated for
@@ -119,23 +118,23 @@ def run(
     states, covariances = np.zeros((K, n)), np.zeros((K, n, n))
     nis_of, statistic, threshold = np.full((3, K), np.nan)
     n_rows, triggered = np.zeros(K, np.int64), np.zeros(K, bool)
-    Phi, Q = np.eye(n), np.zeros((n, n))
+    Phi, Q, nothing = np.eye(n), np.zeros((n, n)), np.zeros((n, n))  # what the first epoch is carried by
     for k in range(K):
         x = x.copy()
         if k:
             x[:moving], Phi[:moving, :moving], Q[:moving, :moving] = motion.predict(k, x[:moving])
         parts = [rows for source in sources if (rows := source.rows(k, x)) is not None]
-        moved = P if k == 0 else kalman.predict(P, Phi, np.zeros((n, n)))
+        moved = kalman.predict(P, Phi, nothing)
         if not parts:
-            P = moved + Q if k else P
+            P = moved + Q
         else:
             rows = stacked(parts)
             nu, H = rows.linearised(x)
-            rows = _weighed(rows, nu, H, moved + Q if k else P, options.losses)
+            rows = _weighed(rows, nu, H, moved + Q, options.losses)
             if options.strong_tracking and k:
                 factor, fading = _fading(fading, moved, Q, nu, H, rows.R)
                 moved = factor * moved
-            prior = moved + Q if k else P
+            prior = moved + Q
             dx, P_post, nis = _corrected(options.update, prior, x, rows, nu, H)
             update = Update(x, prior, x + dx, P_post, rows, H)
             if options.observe is not None:
@@ -186,13 +185,10 @@ def _corrected(form: Form, P: Array, x: Array, rows: Rows, nu: Array, H: Array) 
         at_nu, at_H = rows.linearised(at)
         return solve_triangular(L, at_nu, lower=True), solve_triangular(L, at_H[:, free], lower=True)
 
-    def residuals(D: Array) -> Array:
-        return np.array([linearise(d)[0] for d in D])
-
-    own = P[np.ix_(free, free)]
-    u = updates.iterated(own, linearise) if form == "iterated" else updates.sigma_point(own, residuals, cubature(len(free)))
+    square = np.ix_(free, free)
+    u = updates.iterated(P[square], linearise)
     dx, posterior = np.zeros(len(x)), np.zeros_like(P)
-    dx[free], posterior[np.ix_(free, free)] = u.dx, u.P
+    dx[free], posterior[square] = u.dx, u.P
     return dx, posterior, u.nis
 
 

@@ -18,7 +18,7 @@ the source estimates neither.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -35,7 +35,6 @@ from factorgraph.filters.relative.motion import (
     Motion,
     Mover,
     Smooth,
-    integrate,
 )
 from factorgraph.filters.relative.rows import (
     KINDS,
@@ -121,7 +120,6 @@ class Formation:
     names: tuple[str, ...]  # the reference first
     t_s: Array  # (K,) epochs
     movers: tuple[Mover, ...]
-    increments: tuple[Increments, ...]  # of the movers between the epochs, attitude errors white
     places: Places
     own: tuple[OwnTrack | None, ...]
     absolute: tuple[Array, Array, Array]  # (N, K, 3), (N, K, 3), (N, K, 6, 6), ECEF; NaN where unknown
@@ -132,6 +130,8 @@ class Formation:
     heights: dict[int, list[HeightRow]]
     notes: tuple[str, ...]
     warnings: tuple[str, ...]  # what makes its solutions degraded
+    # of the movers between the epochs, attitude errors white or coloured, once a configuration has asked for them
+    increments: dict[bool, list[Increments]] = field(default_factory=dict, init=False)
 
     def run(
         self, configuration: Configuration, correct: Correct | None = None, observe: Callable[[int, Update], None] | None = None
@@ -146,8 +146,10 @@ class Formation:
 
     def _motion(self, c: Configuration) -> Motion:
         if c.motion == "attitude":
-            known = None if c.coloured else self.increments
-            return AttitudeReferenced(self.movers, self.t_s, self.places.reference_e, c.coloured, known)
+            known = self.increments.get(c.coloured)
+            moving = AttitudeReferenced(self.movers, self.t_s, self.places.reference_e, c.coloured, known)
+            self.increments[c.coloured] = moving.increments
+            return moving
         return Smooth(c.motion, len(self.names) - 1, self.t_s, c.walk)
 
     def _sources(self, c: Configuration, n: int) -> list[Source]:
@@ -221,7 +223,6 @@ def prepare(problem: NavigationProblem, motions: Mapping[str, OwnMotion], receiv
         names=names,
         t_s=t_s,
         movers=movers,
-        increments=tuple(integrate(mover, t_s) for mover in movers),
         places=places,
         own=tuple(full[name].track for name in names),
         absolute=_absolute([full[name].track for name in names], t_s, frame),

@@ -210,7 +210,7 @@ class AttitudeReferenced:
         t_s: Array,
         reference_e: Array,
         coloured: bool = False,
-        increments: Sequence[Increments] | None = None,
+        increments: list[Increments] | None = None,
     ) -> None:
         if len(movers) < 2:
             raise InputError("a formation needs a reference and at least one follower")
